@@ -1,0 +1,69 @@
+"""Every error a caller may want to catch, in one tree.
+
+    CovreconError
+    |-- MissionError        a mission file or value that cannot be flown; carries every fault found
+    |-- SceneError          a scene that is missing, unreadable or empty
+    |-- MessageError        bytes from another process that are refused
+    |   `-- VersionError    ... because they speak another major version
+    |-- BusError            the transport could not be opened, or is closed
+    |   `-- NoReply         a query that nobody answered in time
+    |-- VehicleError        a vehicle that cannot be reached or refuses a command
+    |-- JournalError        a journal that cannot be written or read back
+    |-- ReconstructionError input that the reconstructor cannot work with
+    `-- ProcessError        a process of the run that failed
+
+Errors of zenoh, OSQP, Open3D and the like are mapped to these at the edge where they arise. Outcomes of the
+quadratic program are values, not errors (`agents.quadratic_program`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+class CovreconError(Exception):
+    """Root of all errors raised on purpose."""
+
+
+class MissionError(CovreconError):
+    """``faults`` holds one line for each thing wrong, as ``file:line: key: what is wrong``."""
+
+    def __init__(self, faults: Sequence[str]) -> None:
+        super().__init__("\n".join(faults))
+        self.faults = tuple(faults)
+
+
+class SceneError(CovreconError):
+    pass
+
+
+class MessageError(CovreconError):
+    pass
+
+
+class VersionError(MessageError):
+    pass
+
+
+class BusError(CovreconError):
+    pass
+
+
+class NoReply(BusError):
+    pass
+
+
+class VehicleError(CovreconError):
+    pass
+
+
+class JournalError(CovreconError):
+    pass
+
+
+class ReconstructionError(CovreconError):
+    pass
+
+
+class ProcessError(CovreconError):
+    pass

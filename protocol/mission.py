@@ -1,0 +1,252 @@
+"""What is to be flown: the one place where every setting, its unit, its default and the default's source live.
+
+A mission is written as TOML (`protocol.mission_file`). Keys carry their unit; "paper" means
+section "Parameters of the paper's simulation" in PAPER.md, eq. numbers are Coverage-Recon's.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from protocol.geometry import Intrinsics
+
+Metres = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Vector = tuple[Metres, Metres, Metres]
+
+
+class Settings(BaseModel):
+    """A table of the mission file: unknown keys are refused, values never change after loading."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, use_attribute_docstrings=True)
+
+
+class Box(Settings):
+    lower_m: Vector
+    """Smallest x, y, z, world frame."""
+    upper_m: Vector
+    """Largest x, y, z, world frame."""
+
+    @model_validator(mode="after")
+    def _has_volume(self) -> Self:
+        if any(low >= high for low, high in zip(self.lower_m, self.upper_m, strict=True)):
+            raise ValueError(f"upper_m {self.upper_m} must exceed lower_m {self.lower_m} on every axis")
+        return self
+
+    def contains(self, point: tuple[float, ...]) -> bool:
+        bounds = zip(self.lower_m, point, self.upper_m, strict=False)
+        return all(low <= value <= high for low, value, high in bounds)
+
+
+class Target(Box):
+    """B x view angles: the cells that are to be seen (paper: 117,600 of them)."""
+
+    lower_m: Vector = (-3.0, -3.0, 0.0)
+    upper_m: Vector = (3.0, 3.0, 2.0)
+    cell_m: Positive = 0.3
+    """Wished edge of a cell; the lattice uses the nearest size that divides B evenly."""
+    yaw_rad: tuple[float, float] = (-math.pi, math.pi)
+    """Range of the direction from which a cell is seen."""
+    pitch_rad: tuple[float, float] = (math.pi / 3, math.pi / 2)
+    """Its elevation, from the cell up towards the camera; pi/2 is from straight above."""
+    cell_rad: Positive = 0.3
+
+    @model_validator(mode="after")
+    def _angles_ascend(self) -> Self:
+        for name in ("yaw_rad", "pitch_rad"):
+            low, high = getattr(self, name)
+            if low >= high:
+                raise ValueError(f"{name} must be [smaller, larger], got [{low}, {high}]")
+        return self
+
+
+class Sensing(Settings):
+    """h1 of eq. (1) and the decay of eq. (2)."""
+
+    distance_m: Positive = 1.0
+    """D, the best distance from which to see a cell (paper)."""
+    sigma_axis: Positive = 0.07
+    """sigma_1: tolerance of 1 - cos(angle between optical axis and line of sight)."""
+    sigma_view: Positive = 0.095
+    """sigma_2: tolerance of 1 - cos(angle between wished and actual view direction). PAPER.md, error 5."""
+    sigma_distance_m: Positive = 0.3
+    """sigma_3: tolerance of the distance."""
+    decay_per_s: Positive = 3.0
+    """delta_1."""
+    exponent_cut: Annotated[float, Field(gt=0, le=80)] = 12.0
+    """Cells with h1 < exp(-exponent_cut) are left alone; J(t) was the same to the tick from 12 to 300."""
+
+
+class Flight(Box):
+    """Where and how the drones may fly. The paper does not state input bounds; PAPER.md measured with these."""
+
+    lower_m: Vector = (-4.0, -4.0, 0.5)
+    upper_m: Vector = (4.0, 4.0, 5.0)
+    separation_m: Positive = 1.0
+    """d: distance that any two drones keep, centre to centre."""
+    speed_max_mps: Positive = 0.5
+    """Bound of each velocity component."""
+    turn_rate_max_radps: Positive = 0.5
+    """Bound of the camera's yaw and pitch rates."""
+    acceleration_max_mps2: Positive = 4.0
+    """What the vehicle can do, each axis; with response_time_s it bounds the change of a commanded velocity."""
+    angular_acceleration_max_radps2: Positive = 8.0
+    response_time_s: NonNegative = 0.15
+    """First-order lag from commanded to flown velocity; the barriers look ahead by it."""
+    pitch_limits_rad: tuple[float, float] = (math.pi / 3, math.pi / 2)
+    """Range of the gimbal's depression angle."""
+    setpoint_timeout_s: Positive = 0.5
+    """A vehicle whose setpoints stop for so long is braked, whatever the control task does."""
+
+    @model_validator(mode="after")
+    def _limits_ascend(self) -> Self:
+        low, high = self.pitch_limits_rad
+        if not -math.pi / 2 <= low < high <= math.pi / 2:
+            raise ValueError(f"pitch_limits_rad must ascend within [-pi/2, pi/2], got [{low}, {high}]")
+        return self
+
+
+class Controller(Settings):
+    """The QP of one drone."""
+
+    planner: Literal["coverage"] = "coverage"
+    rate_hz: Positive = 20.0
+    """Ticks a second of the whole mission, not of the controller alone (paper)."""
+    effort_weight: Positive = 0.01
+    """epsilon."""
+    coverage_rate_per_s: Positive = 0.012
+    """gamma: wished mean decay of a drone's own cells."""
+    sampling_gain_per_s: Positive = 1.0
+    """a1."""
+    pitch_gain_per_s: Positive = 1.0
+    """a2."""
+    separation_gain_per_s: Positive = 1.0
+    """a3; the region rows use it too."""
+
+
+class Feedback(Settings):
+    """Jumps of the importance where the mesh still changes, eqs. (4) and (5)."""
+
+    method: Literal["grid", "none"] = "grid"
+    gain: NonNegative = 1.0
+    """delta_2'."""
+    threshold: Annotated[float, Field(ge=0, le=1)] = 0.5
+    """J_th: no jumps while J is at or above it."""
+    period_s: Positive = 2.0
+    """Time between two meshes that are compared."""
+    delay_s: NonNegative = 1.0
+    """Age at which a jump takes effect, the same in every process: time to compute and to travel."""
+    kappa: Positive = 0.7
+    """Vertex-count change that counts, eq. (5)."""
+    kernel_m: Positive = 0.4
+    """sigma_4."""
+    spacing_m: Positive = 0.3
+    """Spacing of the evaluation points r_k; not stated in the paper (PAPER.md, error 6)."""
+    normalisation: Literal["sum", "mean"] = "mean"
+    """"sum" as printed; "mean" divides by the kernel's weight, so that one jump never exceeds the gain."""
+
+
+class Camera(Settings):
+    width_px: Annotated[int, Field(ge=32, le=4096)] = 320
+    height_px: Annotated[int, Field(ge=32, le=4096)] = 180
+    horizontal_fov_rad: Annotated[float, Field(gt=0.1, lt=2.8)] = 2 * math.atan(36 / 2 / 24)
+    """24 mm equivalent (paper): 73.7 degrees."""
+    keyframe_baseline_m: Positive = 0.12
+    """A keyframe is taken when the camera moved so far since the last ..."""
+    keyframe_angle_rad: Positive = math.radians(15)
+    """... or turned so far."""
+    jpeg_quality: Annotated[int, Field(ge=30, le=100)] = 90
+
+    def intrinsics(self) -> Intrinsics:
+        return Intrinsics.from_field_of_view(self.width_px, self.height_px, self.horizontal_fov_rad)
+
+
+class Reconstruction(Settings):
+    """Images to mesh; numbers from notes/reconstruction.md, section 2."""
+
+    backend: Literal["plane_sweep", "none"] = "plane_sweep"
+    sweep_width_px: Annotated[int, Field(ge=32, le=1024)] = 128
+    """Width at which depth is computed; the height follows from the camera."""
+    depth_planes: Annotated[int, Field(ge=8, le=256)] = 48
+    nearest_m: Positive = 0.35
+    farthest_m: Positive = 4.2
+    sources: Annotated[int, Field(ge=1, le=8)] = 4
+    """Other keyframes that one keyframe is compared with."""
+    voxel_m: Positive = 0.025
+    truncation_m: Positive = 0.05
+    workers: Annotated[int, Field(ge=1, le=64)] = 2
+    """Threads that compute depth maps; the mesh does not depend on it."""
+
+
+class Simulation(Settings):
+    scene: str = "living_room"
+    """A scene's name, or the path of a folder or glb/obj/ply file, relative to the mission file."""
+    image_noise: NonNegative = 2.0
+    """Standard deviation of the camera's noise, in grey levels of 255."""
+
+
+class Transport(Settings):
+    """How the processes reach each other."""
+
+    endpoint: str = ""
+    """zenoh endpoint of the ground station's router; empty: a unix socket in the run folder."""
+
+
+class Drone(Settings):
+    id: Annotated[int, Field(ge=1, le=255)]
+    start: tuple[Metres, Metres, Metres, Metres, Metres]
+    """x, y, z in metres, yaw, pitch (depression) in radians."""
+
+
+class Mission(Settings):
+    """The whole mission. ``drones`` may be left out: then ``covrecon run --drones N`` places them."""
+
+    name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")] = "mission"
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
+    duration_s: Positive = 1500.0
+    """The mission ends after so long (paper: up to 1500 s) ..."""
+    stop_below: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """... or when J falls below this."""
+    target: Target = Target()
+    sensing: Sensing = Sensing()
+    flight: Flight = Flight()
+    controller: Controller = Controller()
+    feedback: Feedback = Feedback()
+    camera: Camera = Camera()
+    reconstruction: Reconstruction = Reconstruction()
+    simulation: Simulation = Simulation()
+    transport: Transport = Transport()
+    drones: Annotated[tuple[Drone, ...], Field(min_length=1)]
+
+    @property
+    def tick_s(self) -> float:
+        return 1.0 / self.controller.rate_hz
+
+    @model_validator(mode="after")
+    def _team_can_start(self) -> Self:
+        faults = []
+        ids = [drone.id for drone in self.drones]
+        if len(set(ids)) != len(ids):
+            faults.append(f"drones: ids must differ, got {ids}")
+        low, high = self.flight.pitch_limits_rad
+        for index, drone in enumerate(self.drones):
+            if not self.flight.contains(drone.start[:3]):
+                faults.append(f"drones.{index}.start: {list(drone.start[:3])} lies outside the flight region")
+            if not low <= drone.start[4] <= high:
+                faults.append(f"drones.{index}.start: pitch {drone.start[4]:g} lies outside flight.pitch_limits_rad")
+            for other in range(index):
+                gap = math.dist(drone.start[:3], self.drones[other].start[:3])
+                if gap < self.flight.separation_m:
+                    faults.append(
+                        f"drones.{index}.start: {gap:.2f} m from drone {self.drones[other].id},"
+                        f" less than flight.separation_m {self.flight.separation_m:g}"
+                    )
+        if self.reconstruction.nearest_m >= self.reconstruction.farthest_m:
+            faults.append("reconstruction.nearest_m: must be less than farthest_m")
+        if faults:
+            raise ValueError("\n".join(faults))
+        return self
