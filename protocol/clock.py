@@ -1,0 +1,47 @@
+"""Where ticks come from. Time is injected: nothing in the mission reads a wall clock by itself."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from typing import Protocol
+
+from protocol import topics
+from protocol.bus import Bus
+from protocol.messages import Tick
+
+
+class Clock(Protocol):
+    async def next_tick(self, timeout_s: float) -> Tick | None:
+        """The next tick in order; None when none came in ``timeout_s`` of wall time."""
+        ...
+
+    def now_s(self) -> float:
+        """Monotonic seconds by which silence is judged; callable from any thread."""
+        ...
+
+
+class SimulatorClock:
+    """Ticks of the internal simulator.
+
+    In lockstep, time is the mission's own and stands still while the simulator waits; in real time it is the
+    machine's, so that a simulator that stops is noticed like any vehicle that does.
+    """
+
+    def __init__(self, bus: Bus, *, lockstep: bool) -> None:
+        self._bus, self._lockstep = bus, lockstep
+        self._ticks: deque[Tick] = deque()
+        self._time_s = 0.0
+        bus.on(topics.TICK, self._hear)
+
+    def _hear(self, tick: Tick) -> None:
+        self._ticks.append(tick)
+        self._time_s = tick.time_s
+
+    async def next_tick(self, timeout_s: float) -> Tick | None:
+        if await self._bus.until(lambda: bool(self._ticks), timeout_s):
+            return self._ticks.popleft()
+        return None
+
+    def now_s(self) -> float:
+        return self._time_s if self._lockstep else time.monotonic()

@@ -1,0 +1,29 @@
+"""When a camera has moved enough for another keyframe; the same rule in cameras (to save bandwidth) and on the ground."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from protocol.geometry import Floats
+from protocol.mission import Camera
+
+
+class KeyframeRule:
+    """For one camera: by baseline or by angle, whichever comes first."""
+
+    def __init__(self, camera: Camera) -> None:
+        self._baseline_m = camera.keyframe_baseline_m
+        self._cosine = math.cos(camera.keyframe_angle_rad)
+        self._last: tuple[Floats, Floats] | None = None
+
+    def wants(self, position: Floats, rotation: Floats) -> bool:
+        """Whether a frame at ``position`` (3,), camera-to-world ``rotation`` (3, 3), is a keyframe; if so, remember it."""
+        if self._last is not None:
+            moved = math.dist(position, self._last[0])
+            turned_cosine = (float(np.sum(rotation * self._last[1])) - 1) / 2  # trace of R^T R' = 1 + 2 cos
+            if moved < self._baseline_m and turned_cosine > self._cosine:
+                return False
+        self._last = (position, rotation)
+        return True

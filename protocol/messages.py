@@ -1,0 +1,195 @@
+"""Every message that two processes exchange. SI units, world frame of `protocol.geometry`, ticks of the mission."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field
+
+from protocol.wire import Finite, Message, WireArray
+
+DroneId = Annotated[int, Field(ge=1, le=255)]
+TickNumber = Annotated[int, Field(ge=0)]
+Count = Annotated[int, Field(ge=0)]
+Vector3 = tuple[Finite, Finite, Finite]
+Vector5 = tuple[Finite, Finite, Finite, Finite, Finite]
+"""x, y, z, camera yaw, camera pitch (depression), or their rates."""
+Outcome = Literal["solved", "infeasible", "out_of_time", "numerical", "none"]
+"""What the solver said; anything but "solved" brakes. "none" before the first decision."""
+Phase = Literal["starting", "flying", "finished"]
+
+
+class VehicleSample(Message):
+    """One vehicle's own estimate of where it is and how it moves."""
+
+    name: ClassVar[str] = "vehicle_sample"
+    drone: DroneId
+    pose: Vector5
+    velocity: Vector5
+    battery: Annotated[float, Field(ge=0, le=1)]
+
+
+class Tick(Message):
+    """The simulator's beat: all that is true at the start of tick ``tick``."""
+
+    name: ClassVar[str] = "tick"
+    tick: TickNumber
+    time_s: Finite
+    lockstep: bool
+    """Whether the next tick waits for everybody's answer to this one."""
+    live: tuple[DroneId, ...]
+    """Drones whose states this tick is to be integrated with, ascending."""
+    vehicles: tuple[VehicleSample, ...]
+    jump_epoch: Count
+    next_jump: Count
+    """Jumps with a smaller sequence number take effect before this tick is integrated."""
+    keyframes: Count
+    """Keyframes sent before this tick."""
+
+
+class Setpoint(Message):
+    """Velocity that a drone's agent wants flown from tick ``tick`` on; to the internal simulator alone."""
+
+    name: ClassVar[str] = "setpoint"
+    drone: DroneId
+    tick: TickNumber
+    velocity: Vector5
+
+
+class Control(Message):
+    """How one tick's velocity came about: a safety filter that explains itself."""
+
+    name: ClassVar[str] = "control"
+    tick: TickNumber
+    outcome: Outcome
+    velocity: Vector5
+    """What the vehicle said it was really sent."""
+    slack: Finite
+    """w of the QP: how far the sampling row falls short of the wished rate; 0 or negative."""
+    sampling: Finite
+    """I_i of eq. (10), the drone's contribution to the fall of J x m, 1/s."""
+    solve_s: Finite
+    separation_margin_m2: Finite
+    """Smallest barrier value among the separation rows; negative: too close."""
+    region_margin_m: Finite
+    pitch_margin_rad2: Finite
+    active: tuple[str, ...]
+    """Rows that hold with equality."""
+    fallbacks: Count
+    """Ticks so far that braked because the solver did not say "solved"."""
+    refused: Count
+    """Messages refused so far by this process."""
+
+
+class DroneState(Message):
+    """Published by each agent every tick; the team's states are the log from which phi is integrated."""
+
+    name: ClassVar[str] = "state"
+    drone: DroneId
+    tick: TickNumber
+    pose: Vector5
+    velocity: Vector5
+    battery: Annotated[float, Field(ge=0, le=1)]
+    mode: Literal["waiting", "flying", "braking", "finished"]
+    importance: Finite
+    """J of this replica before the tick is integrated."""
+    control: Control | None
+    """The decision of the tick before."""
+
+
+class Keyframe(Message):
+    """One posed image. The image is a JPEG; the pose is that of the camera, not of the airframe."""
+
+    name: ClassVar[str] = "keyframe"
+    drone: DroneId
+    sequence: Count
+    tick: TickNumber
+    position: Vector3
+    rotation: tuple[Vector3, Vector3, Vector3]
+    """Rows of the camera-to-world rotation; camera axes right, down, forward."""
+    width: Annotated[int, Field(ge=1, le=8192)]
+    height: Annotated[int, Field(ge=1, le=8192)]
+    fx: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+    fy: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+    cx: Finite
+    cy: Finite
+    jpeg: bytes
+
+
+class Jump(Message):
+    """One map update's effect on phi, eq. (4); applied once and in order of ``sequence`` within ``epoch``."""
+
+    name: ClassVar[str] = "jump"
+    epoch: Count
+    """Identity of the journal; a new one means that older jumps are void."""
+    sequence: Count
+    tick: TickNumber
+    """Takes effect before this tick is integrated."""
+    increments: WireArray
+    """delta_2 h2, float32 (positions,), added to every direction of a position."""
+
+
+class JumpHead(Message):
+    """How far the ground station's journal has got; a replica that is behind knows what to fetch."""
+
+    name: ClassVar[str] = "jump_head"
+    epoch: Count
+    next_sequence: Count
+    done: TickNumber
+    """All jumps that take effect up to and including this tick are out."""
+    phase: Phase
+
+
+class JournalPage(Message):
+    """Reply to a range query of ``phi/journal``: encoded jumps in order."""
+
+    name: ClassVar[str] = "journal_page"
+    epoch: Count
+    next_sequence: Count
+    jumps: tuple[bytes, ...]
+
+
+class MissionPhase(Message):
+    """Broadcast by the ground station, repeated: what everybody should be doing."""
+
+    name: ClassVar[str] = "mission_phase"
+    phase: Phase
+    reason: str
+
+
+class DroneStatus(Message):
+    """One row of the live table."""
+
+    name: ClassVar[str] = "drone_status"
+    drone: DroneId
+    alive: bool
+    mode: str
+    position: Vector3
+    speed_mps: Finite
+    separation_m: Finite
+    slack: Finite
+    solve_s: Finite
+    fallbacks: Count
+
+
+class Status(Message):
+    """What a person wants to see while the mission runs; about once a wall second."""
+
+    name: ClassVar[str] = "status"
+    phase: Phase
+    activity: str
+    """What the ground station is doing, in words."""
+    tick: TickNumber
+    time_s: Finite
+    importance: Finite
+    f_score_visible: Finite
+    f_score_objects: Finite
+    keyframes: Count
+    dropped: Count
+    """Keyframes lost or refused."""
+    keyframes_per_s: Finite
+    """Per second of wall time."""
+    jumps: Count
+    min_separation_m: Finite
+    """Smallest distance between two drones so far; 0 with a single drone."""
+    drones: tuple[DroneStatus, ...]

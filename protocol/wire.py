@@ -1,0 +1,105 @@
+"""Wire format: one MessagePack map of a version, a message name and typed fields, checked by pydantic.
+
+Arrays travel as ``[dtype, shape, little-endian bytes]``. Whatever does not fit exactly - another major version, a
+wrong type, a wrong length, a number that is not finite - is refused with `MessageError`; nothing is guessed.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, ClassVar, TypeVar
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, ValidationError
+
+from protocol.errors import MessageError, VersionError
+
+WIRE_VERSION = 1
+"""Major version; a new field with a default does not change it."""
+MAX_MESSAGE_BYTES = 16 * 2**20
+_ARRAY_DTYPES = ("<f4", "<f8", "<i4", "|u1")
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+def _array_from_wire(value: object) -> NDArray[Any]:
+    if isinstance(value, np.ndarray):
+        return value
+    match value:
+        case (str(dtype), tuple(shape), bytes(data)) if dtype in _ARRAY_DTYPES:
+            pass
+        case _:
+            raise ValueError("not an array of [dtype, shape, bytes]")
+    if not all(isinstance(length, int) and length >= 0 for length in shape):
+        raise ValueError(f"shape {shape} is not made of lengths")
+    if math.prod(shape) * np.dtype(dtype).itemsize != len(data):
+        raise ValueError(f"{len(data)} bytes do not fill shape {shape} of {dtype}")
+    array = np.frombuffer(data, dtype).reshape(shape)
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise ValueError("holds numbers that are not finite")
+    return array
+
+
+def _array_to_wire(array: NDArray[Any]) -> tuple[str, tuple[int, ...], bytes]:
+    little = array.dtype.newbyteorder("<")
+    return little.str, array.shape, np.ascontiguousarray(array, little).tobytes()
+
+
+WireArray = Annotated[
+    NDArray[Any], BeforeValidator(_array_from_wire), PlainSerializer(_array_to_wire, return_type=tuple)
+]
+
+
+class Message(BaseModel):
+    """Base of all that crosses a process boundary; ``name`` tells which message the bytes hold."""
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, arbitrary_types_allowed=True, use_attribute_docstrings=True
+    )
+    name: ClassVar[str]
+
+
+M = TypeVar("M", bound=Message)
+
+
+def encode(message: Message) -> bytes:
+    packed: bytes = msgpack.packb({"v": WIRE_VERSION, "n": message.name, **message.__dict__}, default=_plain)
+    return packed
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, np.ndarray):
+        return _array_to_wire(value)
+    if isinstance(value, BaseModel):
+        return value.__dict__
+    raise TypeError(f"{type(value).__name__} has no wire format")
+
+
+def decode(kind: type[M], data: bytes) -> M:
+    """The message in ``data``.
+
+    Raises:
+        VersionError: another major version speaks.
+        MessageError: anything else that is not exactly a ``kind``.
+    """
+    if len(data) > MAX_MESSAGE_BYTES:
+        raise MessageError(f"{kind.name}: {len(data)} bytes exceed the limit of {MAX_MESSAGE_BYTES}")
+    try:
+        fields = msgpack.unpackb(data, use_list=False)
+    except (ValueError, TypeError, msgpack.UnpackException) as error:
+        raise MessageError(f"{kind.name}: not MessagePack: {error}") from error
+    if not isinstance(fields, dict):
+        raise MessageError(f"{kind.name}: not a map")
+    version, name = fields.pop("v", None), fields.pop("n", None)
+    if version != WIRE_VERSION:
+        raise VersionError(f"{kind.name}: wire version {version!r}, this process speaks {WIRE_VERSION}")
+    if name != kind.name:
+        raise MessageError(f"{kind.name}: holds a message {name!r}")
+    try:
+        return kind.model_validate(fields)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise MessageError(f"{kind.name}.{place}: {first['msg']}") from error
