@@ -1,0 +1,133 @@
+"""Strict rows of the QP: every one says ``coefficients . u >= bound`` for the commanded velocity u, (5,).
+
+The paper's barriers assume that a drone flies the commanded velocity at once. A vehicle lags: to first order
+``tau dv/dt = u - v``. Then ``y = p + tau v`` moves exactly as commanded, ``dy/dt = u``, so every barrier is built on
+the *predicted* pose y, and p, a moving average of past y, stays where y stayed: inside the box exactly, and outside
+the separation ball when the ball is widened as `widened_separation` says. With the rows held, y never leaves the safe
+set, also when u is constant over a tick of length h <= 1/a: b falls at most by a h b.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from protocol.geometry import Floats
+from protocol.mission import Flight, Mission
+
+
+@dataclass(frozen=True, slots=True)
+class Neighbour:
+    """Another drone as last heard of; silence makes it larger, never smaller."""
+
+    drone: int
+    position: Floats
+    """(3,) metres, predicted: p + tau v at the time of its state."""
+    age_s: float
+    """Beyond the tick at hand; 0 when its state is of this very tick."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """Strict rows ``coefficients @ u >= bounds``; ``barriers`` are the b that they keep from becoming negative."""
+
+    names: tuple[str, ...]
+    coefficients: Floats
+    """(rows, 5)."""
+    bounds: Floats
+    """(rows,)."""
+    barriers: Floats
+    """(rows,)."""
+
+    def margin(self, kind: str, without: float) -> float:
+        """Smallest barrier among the rows of one kind; ``without`` if there is none."""
+        chosen = [b for name, b in zip(self.names, self.barriers, strict=True) if name.startswith(kind)]
+        return float(min(chosen, default=without))
+
+
+def predicted_pose(pose: Floats, velocity: Floats, flight: Flight) -> Floats:
+    """y = p + tau v, (5,)."""
+    return pose + flight.response_time_s * velocity
+
+
+def top_speed(flight: Flight) -> float:
+    """Largest speed in m/s when every component is at its bound."""
+    return math.sqrt(3) * flight.speed_max_mps
+
+
+def widened_separation(flight: Flight) -> float:
+    """Separation D of predicted positions that keeps true positions ``separation_m`` apart, metres.
+
+    While the predicted offset stays at least D away from the origin and moves at most at V, its direction turns at
+    most at w = V / D, and its moving average over exp(-t / tau) keeps at least D / (1 + (w tau)^2) along the
+    present direction. D is the root of D / (1 + (V tau / D)^2) = d.
+    """
+    lag = 2 * top_speed(flight) * flight.response_time_s
+    wide = flight.separation_m
+    for _ in range(50):  # converges from below: the map is a contraction for lag < d
+        wide = flight.separation_m * (1 + (lag / wide) ** 2)
+    return wide
+
+
+REGION = ("region:-x", "region:-y", "region:-z", "region:+x", "region:+y", "region:+z")
+PITCH = "pitch"
+FIXED_ROWS = 1 + len(REGION)
+"""Rows that a lone drone has."""
+
+
+class Barriers:
+    """The strict rows and input bounds of one drone, from a mission's flight and controller settings."""
+
+    def __init__(self, mission: Mission) -> None:
+        flight, controller = mission.flight, mission.controller
+        low, high = flight.pitch_limits_rad
+        self._pitch_mid, self._pitch_reach = (low + high) / 2, ((high - low) / 2) ** 2
+        self._pitch_gain, self._gain = controller.pitch_gain_per_s, controller.separation_gain_per_s
+        self._faces = np.concatenate([flight.lower_m, np.negative(flight.upper_m)])
+        self._region = np.zeros((FIXED_ROWS, 5))
+        self._region[1:4, :3], self._region[4:7, :3] = np.eye(3), -np.eye(3)
+        self._wide, self._top_speed = widened_separation(flight), top_speed(flight)
+        self._speed = np.array([flight.speed_max_mps] * 3 + [flight.turn_rate_max_radps] * 2)
+        acceleration = [flight.acceleration_max_mps2] * 3 + [flight.angular_acceleration_max_radps2] * 2
+        self._change = np.array(acceleration) * flight.response_time_s if flight.response_time_s else np.full(5, np.inf)
+
+    def rows(self, predicted: Floats, neighbours: Sequence[Neighbour]) -> Rows:
+        """All strict rows at the predicted pose (5,).
+
+        pitch: b = ((max - min) / 2)^2 - (pitch - mid)^2; as printed it allows twice the range (PAPER.md, error 2).
+        region: b = distance inside each of the six faces.
+        separation:<id>: one per neighbour (PAPER.md, error 7), b = |dy|^2 - D^2, and each of the two drones may use
+        half of the closing speed that keeps b from becoming negative. A neighbour that has been silent for ``age``
+        keeps its place, and D grows by ``age`` times its top speed.
+        """
+        count = FIXED_ROWS + len(neighbours)
+        coefficients, barriers = np.zeros((count, 5)), np.empty(count)
+        coefficients[:FIXED_ROWS] = self._region
+        away = predicted[4] - self._pitch_mid
+        coefficients[0, 4] = -2 * away
+        barriers[0] = self._pitch_reach - away * away
+        barriers[1:4] = predicted[:3]
+        barriers[4:7] = -predicted[:3]
+        barriers[1:7] -= self._faces
+        if neighbours:
+            offsets = predicted[:3] - np.array([neighbour.position for neighbour in neighbours])
+            distances = self._wide + self._top_speed * np.array([neighbour.age_s for neighbour in neighbours])
+            coefficients[FIXED_ROWS:, :3] = 2 * offsets
+            barriers[FIXED_ROWS:] = (offsets * offsets).sum(axis=1) - distances * distances
+        bounds = -self._gain * barriers
+        bounds[0] = -self._pitch_gain * barriers[0]
+        names = (PITCH, *REGION, *[f"separation:{neighbour.drone}" for neighbour in neighbours])
+        return Rows(names, coefficients, bounds, barriers)
+
+    def velocity_bounds(self, velocity: Floats) -> tuple[Floats, Floats]:
+        """Lower and upper bound of u, (5,) each: the input box U, and no more acceleration than the vehicle has.
+
+        The lag turns a command u into the acceleration (u - v) / tau, so |u - v| <= tau x acceleration keeps the
+        first-order model, on which all rows rest, true. Zero velocity always stays allowed: a drone may brake.
+        """
+        low = np.minimum(np.maximum(-self._speed, velocity - self._change), 0.0)
+        high = np.maximum(np.minimum(self._speed, velocity + self._change), 0.0)
+        return low, high

@@ -1,0 +1,80 @@
+"""The paper's controller: one drone's velocity for the next tick, from its own cells and its neighbours.
+
+`Planner` is what every method behind the same safety rows offers; baselines differ in how they want to move.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from agents.barriers import FIXED_ROWS, Barriers, Neighbour, Rows, predicted_pose, top_speed
+from agents.quadratic_program import Outcome, QuadraticProgram
+from protocol.geometry import Floats
+from protocol.importance import SamplingTerms
+from protocol.mission import Mission
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """The velocity to fly and why."""
+
+    velocity: Floats
+    """(5,) m/s and rad/s, world frame."""
+    outcome: Outcome
+    slack: float
+    sampling: float
+    """I_i = sum of delta_1 h1 phi over the drone's own cells, 1/s."""
+    rows: Rows
+    active: tuple[str, ...]
+
+
+class Planner(Protocol):
+    def decide(
+        self, pose: Floats, velocity: Floats, neighbours: Sequence[Neighbour], terms: SamplingTerms, cells: float
+    ) -> Decision:
+        """Own ``pose`` and ``velocity`` (5,); the field's ``terms``; ``cells`` = |V_i|."""
+        ...
+
+
+class CoverageController:
+    """Coverage-Recon's QP-based controller with strict safety rows."""
+
+    def __init__(self, mission: Mission, neighbours: int) -> None:
+        """``neighbours``: the most that will ever be known."""
+        self._mission = mission
+        self._barriers = Barriers(mission)
+        self._program = QuadraticProgram(FIXED_ROWS + neighbours, mission.controller.effort_weight)
+
+    def decide(
+        self, pose: Floats, velocity: Floats, neighbours: Sequence[Neighbour], terms: SamplingTerms, cells: float
+    ) -> Decision:
+        settings, flight = self._mission.controller, self._mission.flight
+        a1, decay = settings.sampling_gain_per_s, self._mission.sensing.decay_per_s
+
+        # Sampling row, eqs. (15a) and (15b): keep b = I_i - |V_i| gamma from falling below zero, up to the slack.
+        xi1 = decay * terms.gradient
+        sampling = decay * terms.first
+        xi2 = a1 * (sampling - cells * settings.coverage_rate_per_s) - decay * decay * terms.second
+
+        # Strict rows: never relaxed.
+        predicted = predicted_pose(pose, velocity, flight)
+        rows = self._barriers.rows(predicted, neighbours)
+        low, high = self._barriers.velocity_bounds(velocity)
+        solution = self._program.solve(xi1, xi2, rows, low, high)
+        if solution.outcome == "solved":
+            return Decision(solution.velocity, "solved", solution.slack, sampling, rows, solution.active)
+        return Decision(self.brake(rows, low, high), solution.outcome, 0.0, sampling, rows, ())
+
+    def brake(self, rows: Rows, low: Floats, high: Floats) -> Floats:
+        """Stop; or, when a neighbour is already too near, move away from the worst unless another row forbids it."""
+        worst = int(np.argmin(rows.barriers))
+        if rows.barriers[worst] < 0 and rows.names[worst].startswith("separation"):
+            away = rows.coefficients[worst] / np.linalg.norm(rows.coefficients[worst])
+            retreat = np.clip(away * top_speed(self._mission.flight), low, high)
+            if (rows.coefficients @ retreat >= np.minimum(rows.bounds, 0.0)).all():
+                return retreat
+        return np.zeros(5)
