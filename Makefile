@@ -28,9 +28,10 @@ check: $(INSTALLED) ## formatting, lint, types, layers, dependencies: what CI ch
 bench: $(INSTALLED) ## the benchmarks, one after another
 	@$(ONE_THREAD) $(BIN)/python -m pytest tests/benchmarks
 
-format: $(INSTALLED) ## rewrite the code in the common format
+format: $(INSTALLED) ## rewrite the code in the common format, and the mission schema from the model
 	@$(BIN)/ruff format .
 	@$(BIN)/ruff check --fix .
+	@$(BIN)/covrecon mission schema > protocol/mission.schema.json
 
 install: $(INSTALLED) ## only what demo and test do first
 

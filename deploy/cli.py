@@ -1,0 +1,149 @@
+"""The command ``covrecon``.
+
+Exit codes: 0 all went well, 1 something failed, 2 bad input; 128 + n after signal n. Commands import what they need
+when they run, so that help and completion answer at once.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated, Literal, NoReturn
+
+from cyclopts import App, Parameter
+
+from protocol.errors import CovreconError, MissionError, SceneError
+from protocol.guard import require_own_packages
+
+
+def _version() -> str:
+    from importlib.metadata import version
+
+    return version("coverage-recon")
+
+
+app = App(
+    name="covrecon",
+    help="Drones that photograph a scene, map it while flying, and fly on to where the map changes.",
+    version=_version,
+)
+mission_app = App(name="mission", help="Check and show mission files.")
+app.command(mission_app)
+
+MissionPath = Annotated[Path, Parameter(help="Mission file (TOML).")]
+TeamSize = Annotated[int | None, Parameter(help="Team size; drones that the file does not place start in a grid.")]
+Seed = Annotated[int | None, Parameter(help="Replaces the mission's seed.")]
+
+
+def main() -> NoReturn:
+    """Entry point: every error raised on purpose ends in its message alone."""
+    try:
+        require_own_packages()
+        result = app(result_action="return_value")
+    except (MissionError, SceneError) as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
+    except CovreconError as error:
+        print(error, file=sys.stderr)
+        sys.exit(1)
+    sys.exit(result)
+
+
+@app.command
+def run(
+    mission: MissionPath,
+    /,
+    *,
+    drones: TeamSize = None,
+    speed: Literal["max", "1"] = "max",
+    headless: Annotated[bool, Parameter(negative="", show_default=False)] = False,
+    seed: Seed = None,
+    out: Path = Path("runs"),
+) -> int:
+    """Fly a mission: simulator, ground station and one process a drone, all on this machine.
+
+    Parameters
+    ----------
+    speed
+        "max": as fast as the machine allows, the same seed gives the same result. "1": real time.
+    headless
+        Plain lines instead of the live table.
+    out
+        Where the run's folder is made.
+    """
+    from datetime import UTC, datetime
+
+    from rich.console import Console
+
+    from deploy.mission_run import fly
+    from deploy.progress import LiveDisplay, PlainDisplay
+    from protocol.mission_file import load_mission
+
+    checked = load_mission(mission, drones=drones, seed=seed)
+    console = Console(highlight=False)
+    display = (
+        LiveDisplay(console, checked)
+        if console.is_terminal and not headless
+        else PlainDisplay(lambda text: print(text, flush=True))
+    )
+    return fly(checked, display, out=out, speed=speed, started=datetime.now(UTC))
+
+
+@app.command
+def report(run: Annotated[Path, Parameter(help="A run's folder.")] = Path("runs/latest"), /) -> None:
+    """Write a run's report.html anew, also that of a run which was cut short, and tell what it came to."""
+    from deploy.outcome import SUMMARY_FILE, describe, read_outcome
+    from ground_station.report import write_report
+
+    page = write_report(run.resolve())
+    if (page.parent / SUMMARY_FILE).exists():
+        for line in describe(read_outcome(page.parent), page.parent):
+            print(line)
+    else:
+        print(f"the run was cut short; report: {page}")
+
+
+@mission_app.command
+def check(mission: MissionPath, /, *, drones: TeamSize = None) -> None:
+    """Say all that is wrong with a mission file."""
+    from protocol.mission_file import load_mission
+
+    checked = load_mission(mission, drones=drones)
+    print(f"{mission}: {checked.name} is ready to fly, drones: {len(checked.drones)}")
+
+
+@mission_app.command
+def show(mission: MissionPath, /, *, drones: TeamSize = None, seed: Seed = None) -> None:
+    """Print the effective mission, every default spelt out, as a mission file."""
+    from protocol.mission_file import load_mission, mission_to_toml
+
+    print(mission_to_toml(load_mission(mission, drones=drones, seed=seed)), end="")
+
+
+@mission_app.command
+def schema() -> None:
+    """Print the JSON schema of mission files, for editors."""
+    from protocol.mission_file import mission_schema
+
+    print(mission_schema(), end="")
+
+
+def _process(command: str, module: str, what: str) -> None:
+    """Let ``covrecon COMMAND`` become ``python -m MODULE``, which has its own options and help."""
+
+    def become(*arguments: Annotated[str, Parameter(allow_leading_hyphen=True)]) -> NoReturn:
+        from deploy.local import environment
+
+        # -P keeps the current folder from shadowing a package.
+        argv = [sys.executable, "-P", "-m", module, *arguments]
+        os.execve(sys.executable, argv, environment(os.environ))  # noqa: S606  # the arguments are the caller's own
+
+    app.command(
+        become, name=command, help=f"Start {what} alone; its options: covrecon {command} --help.", help_flags=()
+    )
+
+
+_process("agent", "agents", "one drone")
+_process("ground", "ground_station", "the ground station")
+_process("sim", "sim_bridge", "the simulator")

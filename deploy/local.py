@@ -1,0 +1,202 @@
+"""All processes of a mission on this machine: started, watched, and ended together.
+
+The ground station's end is the run's end. A drone that dies is told about and the others fly on; without the ground
+station or the simulator nothing can go on, so their failure ends the run. Whatever happens, also to the launcher
+itself, no process and no socket stays behind (`deploy.reaper`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from contextlib import asynccontextmanager, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from protocol.errors import ProcessError
+from protocol.guard import ROOT
+
+GRACE_S = 5.0
+"""Between SIGTERM and SIGKILL: time to brake, to close a journal and a session."""
+SETTLE_S = 20.0
+"""What the others get to end by themselves once the ground station is done."""
+LOG_LINES = 15
+"""Last lines of a failed process's log that are shown ..."""
+LOG_BYTES = 16 * 1024
+"""... out of so many bytes."""
+BAD_INPUT = 2
+"""Exit code of a process that refuses its mission, scene or endpoint; any other failure is 1."""
+
+Kind = Literal["ground", "sim", "agent"]
+
+
+@dataclass(frozen=True, slots=True)
+class Role:
+    """One process to start; ``name`` is that of its log."""
+
+    name: str
+    kind: Kind
+    command: tuple[str, ...]
+
+
+def environment(outer: Mapping[str, str]) -> dict[str, str]:
+    """What the processes run under: our packages before any other's, and one numerical thread each.
+
+    They share the machine; who wants more threads starts them by hand. Set values win.
+    """
+    threads = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    fixed = {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1", "PYTHONFAULTHANDLER": "1"}
+    return threads | dict(outer) | fixed
+
+
+def mission_roles(run: Path, endpoint: str, drones: Sequence[int], speed: str) -> list[Role]:
+    """Simulator, ground station and one agent a drone; all read ``mission.json`` in the run folder."""
+
+    def role(name: str, kind: Kind, module: str, *more: str) -> Role:
+        # -P keeps the folder that the launcher was called in from shadowing a package.
+        command = (sys.executable, "-P", "-m", module, "--mission", str(run / "mission.json"))
+        return Role(name, kind, (*command, "--endpoint", endpoint, "--run", str(run), "--speed", speed, *more))
+
+    return [
+        role("sim", "sim", "sim_bridge"),
+        role("ground", "ground", "ground_station"),
+        *(role(f"drone-{drone}", "agent", "agents", "--drone", str(drone)) for drone in drones),
+    ]
+
+
+async def supervise(
+    roles: Sequence[Role],
+    *,
+    logs: Path,
+    private: Path,
+    say: Callable[[str], None],
+    grace_s: float = GRACE_S,
+    settle_s: float = SETTLE_S,
+) -> int:
+    """Start ``roles`` in order and stay until the run is over; its exit code, 0 only if every process ended well.
+
+    Each process writes to its own file in the folder ``logs``. ``private``, the socket's folder, is removed at the
+    end. ``say`` gets what a person should know. Raises `ProcessError` when a command cannot be started.
+    """
+    waits: dict[asyncio.Task[int], Role] = {}
+    with _interruption() as interrupted:
+        try:
+            async with _process_group(private, grace_s) as group:
+                for role in roles:
+                    process = await _start(role, logs / f"{role.name}.log", group)
+                    waits[asyncio.create_task(process.wait())] = role
+                return await _watch(dict(waits), interrupted, logs, say, settle_s)
+        finally:
+            await asyncio.gather(*waits)  # all have ended: take their exit codes, so that no zombie stays
+
+
+async def _watch(
+    waits: dict[asyncio.Task[int], Role],
+    interrupted: asyncio.Future[signal.Signals],
+    logs: Path,
+    say: Callable[[str], None],
+    settle_s: float,
+) -> int:
+    clock = asyncio.get_running_loop().time
+    deadline: float | None = None
+    drone_ended_well = False
+    result = 0
+    while waits:
+        patience = None if deadline is None else max(0.0, deadline - clock())
+        watched: set[asyncio.Future[Any]] = {*waits, interrupted}
+        await asyncio.wait(watched, timeout=patience, return_when=asyncio.FIRST_COMPLETED)
+        if interrupted.done():
+            number = interrupted.result()
+            say(f"{number.name}: ending the run")
+            return 128 + number
+        ended = [task for task in waits if task.done()]
+        if not ended:
+            say(f"not ended {settle_s:g} s after the ground station: {', '.join(role.name for role in waits.values())}")
+            return 1
+        hopeless = False
+        for task in ended:
+            role, code = waits.pop(task), task.result()
+            if code != 0:
+                say(_obituary(role, code, logs))
+                result = result or (BAD_INPUT if code == BAD_INPUT else 1)
+                hopeless |= role.kind != "agent"
+            elif role.kind == "agent":
+                drone_ended_well = True
+            elif role.kind == "ground":
+                deadline = clock() + settle_s
+        drones_left = any(role.kind == "agent" for role in waits.values())
+        if hopeless or (result != 0 and not drones_left and not drone_ended_well):
+            return result
+    return result
+
+
+async def _start(role: Role, log: Path, group: int) -> asyncio.subprocess.Process:
+    with log.open("wb") as output:
+        try:
+            return await asyncio.create_subprocess_exec(
+                *role.command,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=environment(os.environ),
+                process_group=group,
+            )
+        except OSError as error:
+            raise ProcessError(f"{role.name}: cannot start {role.command[0]}: {error.strerror}") from error
+
+
+@asynccontextmanager
+async def _process_group(private: Path, grace_s: float) -> AsyncIterator[int]:
+    """A process group that is ended with this context, or with this process; its number."""
+    script = Path(__file__).with_name("reaper.py")
+    leader = subprocess.Popen(  # noqa: ASYNC220  # a few milliseconds, and nothing else is running yet
+        [sys.executable, "-I", "-S", str(script), str(grace_s), str(private)],
+        stdin=subprocess.PIPE,
+        process_group=0,
+    )
+    try:
+        yield leader.pid
+    finally:
+        await asyncio.to_thread(leader.communicate)  # closes the pipe, the reaper's sign
+        if leader.returncode != 0:  # it had to kill the group, or was killed before it could
+            with suppress(ProcessLookupError):
+                os.killpg(leader.pid, signal.SIGKILL)
+            shutil.rmtree(private, ignore_errors=True)
+
+
+@contextmanager
+def _interruption() -> Iterator[asyncio.Future[signal.Signals]]:
+    """Done once a person or the system asks the run to end."""
+    loop = asyncio.get_running_loop()
+    received: asyncio.Future[signal.Signals] = loop.create_future()
+
+    def receive(number: signal.Signals) -> None:
+        if not received.done():
+            received.set_result(number)
+
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # nohup: the run is to outlive its terminal
+        numbers.append(signal.SIGHUP)
+    for number in numbers:
+        loop.add_signal_handler(number, receive, number)
+    try:
+        yield received
+    finally:
+        for number in numbers:
+            loop.remove_signal_handler(number)
+        received.cancel()
+
+
+def _obituary(role: Role, code: int, logs: Path) -> str:
+    log = logs / f"{role.name}.log"
+    end = f"ended with exit code {code}" if code > 0 else f"was killed by {signal.Signals(-code).name}"
+    with log.open("rb") as file:
+        file.seek(max(0, log.stat().st_size - LOG_BYTES))
+        lines = file.read().decode(errors="replace").splitlines()[-LOG_LINES:]
+    return "\n    ".join([f"{role.name} {end}; end of {log}:", *(lines or ["(empty)"])])

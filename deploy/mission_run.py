@@ -1,0 +1,51 @@
+"""One run from a checked mission to its outcome: folder, socket, processes, display."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import suppress
+from datetime import datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Literal
+
+from deploy.local import Role, mission_roles, supervise
+from deploy.outcome import describe, read_outcome
+from deploy.progress import Display, follow
+from deploy.run_folder import make_run_folder, socket_endpoint, socket_folder_parent
+from protocol.errors import ProcessError
+from protocol.mission import Mission
+
+Speed = Literal["max", "1"]
+
+
+def fly(mission: Mission, display: Display, *, out: Path, speed: Speed, started: datetime) -> int:
+    """Run ``mission`` on this machine and say how it went; the exit code of the command."""
+    with TemporaryDirectory(prefix="covrecon-", dir=socket_folder_parent(), ignore_cleanup_errors=True) as private:
+        endpoint = mission.transport.endpoint or socket_endpoint(Path(private))
+        run = make_run_folder(out, mission, started, endpoint)
+        roles = mission_roles(run, endpoint, [drone.id for drone in mission.drones], speed)
+        with display:
+            display.say(f"{mission.name}: drones {len(mission.drones)}, seed {mission.seed}, run folder {run}")
+            result = asyncio.run(_supervise_and_show(roles, run, Path(private), endpoint, mission, display))
+    try:
+        for line in describe(read_outcome(run), run):
+            display.say(line)
+    except ProcessError as error:
+        if result == 0:
+            raise
+        # A run that ended early said why already.
+        display.say(f"no result: {error}")
+    return result
+
+
+async def _supervise_and_show(
+    roles: list[Role], run: Path, private: Path, endpoint: str, mission: Mission, display: Display
+) -> int:
+    watching = asyncio.create_task(follow(endpoint, mission, display))
+    try:
+        return await supervise(roles, logs=run / "logs", private=private, say=display.say)
+    finally:
+        watching.cancel()
+        with suppress(asyncio.CancelledError):
+            await watching

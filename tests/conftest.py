@@ -1,0 +1,22 @@
+"""What holds for all tests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+TESTS = Path(__file__).parent
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests that start processes run one after another, on one worker: they would starve each other of cores."""
+    for item in items:
+        if item.path.relative_to(TESTS).parts[0] in ("integration", "scenario", "benchmarks"):
+            item.add_marker(pytest.mark.xdist_group("processes"))
+
+
+@pytest.fixture
+def root_path() -> Path:
+    """The project's root, for files that are shipped."""
+    return TESTS.parent
