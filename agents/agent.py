@@ -22,7 +22,7 @@ from protocol.clock import SimulatorClock
 from protocol.errors import NoReply, ProcessError
 from protocol.field import VirtualField
 from protocol.geometry import Floats
-from protocol.importance import ImportanceField
+from protocol.importance import ImportanceField, compile_kernels
 from protocol.messages import Control, DroneState, Jump, MissionPhase, Tick
 from protocol.mission import Mission
 from protocol.replica import Replica
@@ -189,5 +189,6 @@ class Agent:
 
 async def run_agent(mission: Mission, drone: int, endpoint: str, *, lockstep: bool) -> None:
     """Fly one drone of ``mission`` until it ends."""
+    compile_kernels()
     async with connect(endpoint, mission.name, lossless=lockstep) as bus:
         await Agent(mission, drone, bus, lockstep=lockstep).fly()

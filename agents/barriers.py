@@ -48,6 +48,10 @@ class Rows:
         return float(min(chosen, default=without))
 
 
+ROOT_STEPS = 40
+"""Newton steps; from d + lag each at least takes a third off the distance to the root, at the end it squares it."""
+
+
 def predicted_pose(pose: Floats, velocity: Floats, flight: Flight) -> Floats:
     """y = p + tau v, (5,)."""
     return pose + flight.response_time_s * velocity
@@ -63,12 +67,12 @@ def widened_separation(flight: Flight) -> float:
 
     While the predicted offset stays at least D away from the origin and moves at most at V, its direction turns at
     most at w = V / D, and its moving average over exp(-t / tau) keeps at least D / (1 + (w tau)^2) along the
-    present direction. D is the root of D / (1 + (V tau / D)^2) = d.
+    present direction. D is the positive root of D / (1 + (V tau / D)^2) = d, that is of D^3 - d D^2 - d (V tau)^2.
     """
-    lag = 2 * top_speed(flight) * flight.response_time_s
-    wide = flight.separation_m
-    for _ in range(50):  # converges from below: the map is a contraction for lag < d
-        wide = flight.separation_m * (1 + (lag / wide) ** 2)
+    distance, lag = flight.separation_m, 2 * top_speed(flight) * flight.response_time_s
+    wide = distance + lag
+    for _ in range(ROOT_STEPS):  # Newton's steps fall towards the root and never past it: the cubic is convex there
+        wide -= (wide * wide * (wide - distance) - distance * lag * lag) / (wide * (3 * wide - 2 * distance))
     return wide
 
 

@@ -18,6 +18,8 @@ from typing import Literal
 import numpy as np
 import osqp
 import scipy.sparse as sparse
+from numba import njit
+from numpy.typing import NDArray
 
 from agents.barriers import Rows
 from protocol.geometry import Floats
@@ -27,14 +29,15 @@ Outcome = Literal["solved", "infeasible", "out_of_time", "numerical"]
 TOLERANCE = 1e-4
 """Residual that the solver accepts, in m/s or rad/s; strict rows are tightened by as much, so it costs no safety."""
 ACTIVE = 1e-3
-"""A row whose left side is so near its bound, in the row's own unit, is reported as active."""
+"""A strict row or bound that is so near to equality, in m/s or rad/s, is reported as active."""
 CHECK_EVERY = 5
 """Iterations between two tests of convergence; a warm start often needs no more."""
 MAX_ITERATIONS = 4000
 """About a millisecond. A bound in iterations, not in seconds, gives the same answer on a busy machine."""
 
-_SAMPLING, _BOUNDS, _STRICT = 0, 1, 6
 _INFINITY = 1e30  # what the solver takes for no bound
+_VARIABLES, _INPUTS = 6, 5
+_SAMPLING, _BOUNDS, _STRICT = 0, 1, 6
 _AXES = ("bound:x", "bound:y", "bound:z", "bound:yaw", "bound:pitch")
 _OUTCOMES: dict[int, Outcome] = {
     osqp.SolverStatus.OSQP_SOLVED: "solved",
@@ -55,6 +58,58 @@ class Solution:
     """Names of the strict rows and bounds that hold with equality."""
 
 
+@njit(cache=True, nogil=True)
+def _fill(
+    xi1: Floats,
+    xi2: float,
+    coefficients: Floats,
+    bounds: Floats,
+    low: Floats,
+    high: Floats,
+    effort: float,
+    quadratic: Floats,
+    linear: Floats,
+    matrix: Floats,
+    lower: Floats,
+    upper: Floats,
+) -> None:
+    """Write one program's numbers where the solver wants them.
+
+    ``quadratic`` and ``linear`` (6,), ``lower`` and ``upper`` (rows,), and the columns of the constraint ``matrix``
+    one after another: five with sampling, own bound and all strict rows, and the slack's with its single entry.
+    """
+    reach = max(1e-3, 0.5 * np.abs(xi1).sum())
+    cost = reach * max(abs(xi2), reach)
+    quadratic[:_INPUTS] = 2 * effort / cost
+    quadratic[_INPUTS] = 2 * reach * reach / cost
+    linear[_INPUTS] = 2 * xi2 * reach / cost
+    lower[_BOUNDS:_STRICT] = low
+    upper[_BOUNDS:_STRICT] = high
+    lower[_STRICT:] = -_INFINITY
+    column = 2 + lower.size - _STRICT
+    for i in range(_INPUTS):
+        matrix[i * column] = xi1[i] / reach
+        matrix[i * column + 2 : (i + 1) * column] = 0.0
+    for k in range(bounds.size):
+        # Scaled to unit length, a residual is a velocity whatever the row's unit.
+        length = max(np.sqrt((coefficients[k] * coefficients[k]).sum()), 1e-9)
+        for i in range(_INPUTS):
+            matrix[i * column + 2 + k] = coefficients[k, i] / length
+        lower[_STRICT + k] = bounds[k] / length + TOLERANCE
+
+
+@njit(cache=True, nogil=True)
+def _activity(
+    velocity: Floats, coefficients: Floats, bounds: Floats, low: Floats, high: Floats
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which strict rows, and which of the five inputs' bounds, hold with equality."""
+    rows = np.empty(bounds.size, np.bool_)
+    for k in range(bounds.size):
+        length = max(np.sqrt((coefficients[k] * coefficients[k]).sum()), 1e-9)
+        rows[k] = (coefficients[k] * velocity).sum() - bounds[k] < ACTIVE * length
+    return rows, (velocity - low < ACTIVE) | (high - velocity < ACTIVE)
+
+
 class QuadraticProgram:
     """Room for ``strict_rows`` strict rows; unused ones are switched off by infinite bounds."""
 
@@ -62,23 +117,21 @@ class QuadraticProgram:
         self._effort = effort_weight
         rows = _STRICT + strict_rows
         # Every coefficient that may ever be non-zero has its place, so that only values change.
-        pattern = np.zeros((rows, 6), bool)
-        pattern[_SAMPLING] = True
-        pattern[_BOUNDS:_STRICT, :5] = np.eye(5, dtype=bool)
-        pattern[_STRICT:, :5] = True
-        self._pattern = pattern.T.copy()  # column by column, as the solver stores it
-        self._matrix = np.zeros((rows, 6))
-        self._matrix[_SAMPLING, 5] = -1.0
-        self._matrix[_BOUNDS:_STRICT, :5] = np.eye(5)
-        self._low = np.full(rows, -_INFINITY)
-        self._high = np.full(rows, _INFINITY)
+        pattern = np.zeros((rows, _VARIABLES))
+        pattern[_SAMPLING] = 1.0
+        pattern[_BOUNDS:_STRICT, :_INPUTS] = np.eye(_INPUTS)
+        pattern[_STRICT:, :_INPUTS] = 1.0
+        structure = sparse.csc_matrix(pattern)
+        self._quadratic, self._linear = np.ones(_VARIABLES), np.zeros(_VARIABLES)
+        self._matrix = np.ones(structure.nnz)
+        self._matrix[-1] = -1.0
+        self._low, self._high = np.full(rows, -_INFINITY), np.full(rows, _INFINITY)
         self._low[_SAMPLING] = 0.0
-        self._weights, self._linear = np.ones(6), np.zeros(6)
         self._solver = osqp.OSQP()
         self._solver.setup(
-            sparse.eye(6, format="csc"),
-            np.zeros(6),
-            sparse.csc_matrix(pattern.astype(float)),
+            sparse.eye(_VARIABLES, format="csc"),
+            self._linear,
+            structure,
             self._low,
             self._high,
             verbose=False,
@@ -91,31 +144,31 @@ class QuadraticProgram:
 
     def solve(self, xi1: Floats, xi2: float, rows: Rows, low: Floats, high: Floats) -> Solution:
         """``xi1`` (5,) and ``xi2`` of the sampling row; strict ``rows``; bounds ``low``, ``high`` (5,) of u."""
-        reach = max(1e-3, 0.5 * float(np.abs(xi1).sum()))
-        cost = reach * max(abs(xi2), reach)
-        self._matrix[_SAMPLING, :5] = xi1 / reach
-        self._low[_BOUNDS:_STRICT], self._high[_BOUNDS:_STRICT] = low, high
-        # Scaled to unit length, a residual is a velocity whatever the row's unit.
-        lengths = np.maximum(np.sqrt((rows.coefficients * rows.coefficients).sum(axis=1)), 1e-9)
-        last = _STRICT + len(rows.names)
-        self._matrix[_STRICT:last, :5] = rows.coefficients / lengths[:, None]
-        self._low[_STRICT:last] = rows.bounds / lengths + TOLERANCE
-        self._matrix[last:] = 0.0
-        self._low[last:] = -_INFINITY
-        self._weights[:5] = 2 * self._effort / cost
-        self._weights[5] = 2 * reach * reach / cost
-        self._linear[5] = 2 * xi2 * reach / cost
+        _fill(
+            xi1,
+            xi2,
+            rows.coefficients,
+            rows.bounds,
+            low,
+            high,
+            self._effort,
+            self._quadratic,
+            self._linear,
+            self._matrix,
+            self._low,
+            self._high,
+        )
         # The wrapper around the solver copies every statistic into Python objects, at several times the solver's time.
         solver = self._solver._solver
         solver.update_data_vec(q=self._linear, l=self._low, u=self._high)
-        solver.update_data_mat(P_x=self._weights, P_i=None, A_x=self._matrix.T[self._pattern], A_i=None)
+        solver.update_data_mat(P_x=self._quadratic, P_i=None, A_x=self._matrix, A_i=None)
         solver.solve()
         outcome = _OUTCOMES.get(solver.info.status_val, "numerical")
         found = np.array(solver.solution.x)
         if outcome != "solved" or not np.isfinite(found).all():
-            return Solution("numerical" if outcome == "solved" else outcome, np.zeros(5), 0.0, ())
-        velocity = np.clip(found[:5], low, high)
-        tight = np.flatnonzero(rows.coefficients @ velocity - rows.bounds < ACTIVE)
-        limits = np.flatnonzero((velocity - low < ACTIVE) | (high - velocity < ACTIVE))
-        active = [rows.names[k] for k in tight] + [_AXES[k] for k in limits]
+            return Solution("numerical" if outcome == "solved" else outcome, np.zeros(_INPUTS), 0.0, ())
+        velocity = np.minimum(np.maximum(found[:_INPUTS], low), high)
+        tight, limited = _activity(velocity, rows.coefficients, rows.bounds, low, high)
+        active = [name for name, held in zip(rows.names, tight, strict=True) if held]
+        active += [name for name, held in zip(_AXES, limited, strict=True) if held]
         return Solution("solved", velocity, min(0.0, float(xi1 @ velocity) + xi2), tuple(active))

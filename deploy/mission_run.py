@@ -14,6 +14,7 @@ from deploy.outcome import describe, read_outcome
 from deploy.progress import Display, follow
 from deploy.run_folder import make_run_folder, socket_endpoint, socket_folder_parent
 from protocol.errors import ProcessError
+from protocol.importance import compile_kernels
 from protocol.mission import Mission
 
 Speed = Literal["max", "1"]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from protocol.field import VirtualField
 from protocol.geometry import Floats
-from protocol.mission import Sensing
+from protocol.mission import Sensing, Target
 from protocol.sensing import decay_and_terms, owned_shares
 
 SHARE_SAMPLES = 16_000
@@ -87,3 +87,12 @@ class ImportanceField:
             field.xs, field.ys, field.zs, field.directions, poses, self._sigmas, self._sensing.distance_m, self._stride
         )
         return shares * field.size
+
+
+def compile_kernels() -> None:
+    """Let numba compile what a tick needs, or load it from its cache: once on a new machine it takes many seconds,
+    which no process should spend while others wait for it."""
+    field = ImportanceField(VirtualField.of(Target(cell_m=1.0, cell_rad=1.0)), Sensing())
+    poses = np.array([[0.0, 0.0, 2.0, 0.0, 1.5], [0.5, 0.0, 2.0, 0.0, 1.5]])
+    field.advance(poses, 0.05, 0)
+    field.owned_cells(poses)

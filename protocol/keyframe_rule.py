@@ -25,5 +25,5 @@ class KeyframeRule:
             turned_cosine = (float(np.sum(rotation * self._last[1])) - 1) / 2  # trace of R^T R' = 1 + 2 cos
             if moved < self._baseline_m and turned_cosine > self._cosine:
                 return False
-        self._last = (position, rotation)
+        self._last = (position.copy(), rotation.copy())
         return True

@@ -17,6 +17,7 @@ Metres = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Vector = tuple[Metres, Metres, Metres]
+Angle = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class Settings(BaseModel):
@@ -49,9 +50,9 @@ class Target(Box):
     upper_m: Vector = (3.0, 3.0, 2.0)
     cell_m: Positive = 0.3
     """Wished edge of a cell; the lattice uses the nearest size that divides B evenly."""
-    yaw_rad: tuple[float, float] = (-math.pi, math.pi)
+    yaw_rad: tuple[Angle, Angle] = (-math.pi, math.pi)
     """Range of the direction from which a cell is seen."""
-    pitch_rad: tuple[float, float] = (math.pi / 3, math.pi / 2)
+    pitch_rad: tuple[Angle, Angle] = (math.pi / 3, math.pi / 2)
     """Its elevation, from the cell up towards the camera; pi/2 is from straight above."""
     cell_rad: Positive = 0.3
 
@@ -97,7 +98,7 @@ class Flight(Box):
     angular_acceleration_max_radps2: Positive = 8.0
     response_time_s: NonNegative = 0.15
     """First-order lag from commanded to flown velocity; the barriers look ahead by it."""
-    pitch_limits_rad: tuple[float, float] = (math.pi / 3, math.pi / 2)
+    pitch_limits_rad: tuple[Angle, Angle] = (math.pi / 3, math.pi / 2)
     """Range of the gimbal's depression angle."""
     setpoint_timeout_s: Positive = 0.5
     """A vehicle whose setpoints stop for so long is braked, whatever the control task does."""
@@ -139,7 +140,7 @@ class Feedback(Settings):
     period_s: Positive = 2.0
     """Time between two meshes that are compared."""
     delay_s: NonNegative = 1.0
-    """Age at which a jump takes effect, the same in every process: time to compute and to travel."""
+    """Age at which a jump takes effect, the same in every process: time to compute and to travel; at most a period."""
     kappa: Positive = 0.7
     """Vertex-count change that counts, eq. (5)."""
     kernel_m: Positive = 0.4
@@ -149,6 +150,12 @@ class Feedback(Settings):
     normalisation: Literal["sum", "mean"] = "mean"
     """"sum" as printed; "mean" divides by the kernel's weight, so that one jump never exceeds the gain."""
 
+    @model_validator(mode="after")
+    def _jumps_before_the_next_mesh(self) -> Self:
+        if self.delay_s > self.period_s:
+            raise ValueError(f"delay_s {self.delay_s:g} must not exceed period_s {self.period_s:g}")
+        return self
+
 
 class Camera(Settings):
     width_px: Annotated[int, Field(ge=32, le=4096)] = 320
@@ -157,7 +164,7 @@ class Camera(Settings):
     """24 mm equivalent (paper): 73.7 degrees."""
     keyframe_baseline_m: Positive = 0.12
     """A keyframe is taken when the camera moved so far since the last ..."""
-    keyframe_angle_rad: Positive = math.radians(15)
+    keyframe_angle_rad: Annotated[float, Field(gt=0, le=math.pi)] = math.radians(15)
     """... or turned so far."""
     jpeg_quality: Annotated[int, Field(ge=30, le=100)] = 90
 
@@ -198,7 +205,7 @@ class Transport(Settings):
 
 class Drone(Settings):
     id: Annotated[int, Field(ge=1, le=255)]
-    start: tuple[Metres, Metres, Metres, Metres, Metres]
+    start: tuple[Metres, Metres, Metres, Angle, Angle]
     """x, y, z in metres, yaw, pitch (depression) in radians."""
 
 

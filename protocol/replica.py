@@ -1,10 +1,13 @@
 """phi as replicated state: the same jumps, each once and in order, and the same team states, in every process.
 
 Jumps come from the ground station's journal alone, numbered within an epoch. One that comes early is held until the
-gap before it is filled; one that comes again is dropped; one of an unknown epoch is refused until `restart`.
+gap before it is filled; one that comes again is dropped; one of another epoch is refused, because its numbers mean
+something else.
 """
 
 from __future__ import annotations
+
+import numpy as np
 
 from protocol.geometry import Floats
 from protocol.importance import ImportanceField, SamplingTerms
@@ -17,11 +20,11 @@ class Replica:
     def __init__(self, field: ImportanceField, epoch: int = 0) -> None:
         self.field = field
         self.epoch = epoch
-        """0 until the first jump or head tells which journal there is."""
+        """0 until the first jump tells which journal there is."""
         self.next_sequence = 0
         """Jumps below it are held in order or applied."""
         self.refused = 0
-        """Jumps of a wrong shape or epoch."""
+        """Jumps of a wrong shape, type or epoch."""
         self._held: dict[int, Jump] = {}
         self._ready: list[Jump] = []
 
@@ -31,11 +34,12 @@ class Replica:
         return (self.next_sequence, min(self._held)) if self._held else None
 
     def hear(self, jump: Jump) -> None:
-        if self.epoch == 0:
-            self.epoch = jump.epoch
-        if jump.epoch != self.epoch or jump.increments.shape != self.field.phi.shape[:1]:
+        """Take in a jump, whenever and however often it comes."""
+        fits = jump.increments.dtype == np.float32 and jump.increments.shape == self.field.phi.shape[:1]
+        if not fits or self.epoch not in (0, jump.epoch):
             self.refused += 1
             return
+        self.epoch = jump.epoch
         if jump.sequence < self.next_sequence:
             return
         self._held[jump.sequence] = jump

@@ -26,17 +26,23 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 def _array_from_wire(value: object) -> NDArray[Any]:
     if isinstance(value, np.ndarray):
-        return value
+        return _checked(value)
     match value:
         case (str(dtype), tuple(shape), bytes(data)) if dtype in _ARRAY_DTYPES:
             pass
         case _:
             raise ValueError("not an array of [dtype, shape, bytes]")
-    if not all(isinstance(length, int) and length >= 0 for length in shape):
+    if not all(type(length) is int and length >= 0 for length in shape):
         raise ValueError(f"shape {shape} is not made of lengths")
     if math.prod(shape) * np.dtype(dtype).itemsize != len(data):
         raise ValueError(f"{len(data)} bytes do not fill shape {shape} of {dtype}")
-    array = np.frombuffer(data, dtype).reshape(shape)
+    return _checked(np.frombuffer(data, dtype).reshape(shape))
+
+
+def _checked(array: NDArray[Any]) -> NDArray[Any]:
+    """Also for the sender's own arrays: what every receiver would refuse must not be journalled or published."""
+    if array.dtype.newbyteorder("<").str not in _ARRAY_DTYPES:
+        raise ValueError(f"arrays of {array.dtype} do not travel")
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise ValueError("holds numbers that are not finite")
     return array
@@ -65,7 +71,14 @@ M = TypeVar("M", bound=Message)
 
 
 def encode(message: Message) -> bytes:
+    """Bytes for `decode`.
+
+    Raises:
+        MessageError: longer than any receiver accepts.
+    """
     packed: bytes = msgpack.packb({"v": WIRE_VERSION, "n": message.name, **message.__dict__}, default=_plain)
+    if len(packed) > MAX_MESSAGE_BYTES:
+        raise MessageError(f"{message.name}: {len(packed)} bytes exceed the limit of {MAX_MESSAGE_BYTES}")
     return packed
 
 
@@ -93,7 +106,7 @@ def decode(kind: type[M], data: bytes) -> M:
     if not isinstance(fields, dict):
         raise MessageError(f"{kind.name}: not a map")
     version, name = fields.pop("v", None), fields.pop("n", None)
-    if version != WIRE_VERSION:
+    if type(version) is not int or version != WIRE_VERSION:  # True and 1.0 equal 1
         raise VersionError(f"{kind.name}: wire version {version!r}, this process speaks {WIRE_VERSION}")
     if name != kind.name:
         raise MessageError(f"{kind.name}: holds a message {name!r}")

@@ -1,0 +1,148 @@
+"""The map: a truncated signed distance volume over the box to be mapped, into which depth maps are averaged.
+
+Curless and Levoy, 1996. Distances are measured along the optical axis. The volume is dense: the target's box is known
+and small, and a dense array is what the CPU's caches and the mesh extraction like best.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ground_station.reconstruction.views import View
+from protocol.errors import ReconstructionError
+from protocol.mission import Box
+
+BYTES_PER_VOXEL: Final = 11
+"""float32 distance, float32 weight, 3 bytes of colour."""
+BYTES_MAX: Final = 8 * 2**30
+"""A volume above this is a mistake in the mission file, not a wish."""
+WEIGHT_MAX: Final = 20.0
+"""Older views of a voxel are forgotten beyond this weight, so that a moved thing is mapped anew."""
+
+
+class Volume:
+    """``distance`` (X, Y, Z) m, positive in front of surfaces; ``weight`` 0 where never seen; ``color`` (X, Y, Z, 3).
+
+    Voxel (i, j, k) is sampled at ``origin + voxel * (i, j, k)``. The box of the mission grows by the truncation on
+    every side, so that a surface in its faces has a front and a back. The paper's B at 2.5 cm takes 60 MB.
+    """
+
+    def __init__(self, box: Box, voxel_m: float, truncation_m: float) -> None:
+        margin = voxel_m * np.ceil(truncation_m / voxel_m)
+        self.origin = np.array(box.lower_m) - margin
+        shape = np.ceil((np.array(box.upper_m) + margin - self.origin) / voxel_m - 1e-6).astype(int) + 1
+        if float(np.prod(shape.astype(float))) * BYTES_PER_VOXEL > BYTES_MAX:
+            raise ReconstructionError(
+                f"reconstruction.voxel_m {voxel_m:g}: the volume would take over {BYTES_MAX >> 30} GiB"
+            )
+        self.voxel = voxel_m
+        self.truncation = truncation_m
+        self.distance = np.zeros(shape, np.float32)
+        self.weight = np.zeros(shape, np.float32)
+        self.color = np.zeros((*shape, 3), np.uint8)
+
+    @property
+    def size_bytes(self) -> int:
+        return self.distance.nbytes + self.weight.nbytes + self.color.nbytes
+
+    def integrate(
+        self, view: View, depth: NDArray[np.float32], weight: NDArray[np.float32], color: NDArray[np.uint8]
+    ) -> None:
+        """Average in ``depth`` (H, W) m, 0 where unknown, with ``weight`` (H, W) and ``color`` (H, W, 3)."""
+        farthest = float(depth.max(initial=0.0)) + self.truncation
+        if farthest <= self.truncation:
+            return
+        height, width = depth.shape
+        corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]]) - [0.5, 0.5, 0.0]
+        rays = corners @ np.linalg.inv(view.calibration).T @ view.rotation.T
+        reach = np.vstack([view.position, view.position + farthest * rays])
+        lower = np.floor((reach.min(axis=0) - self.origin) / self.voxel).astype(int)
+        upper = np.ceil((reach.max(axis=0) - self.origin) / self.voxel).astype(int) + 1
+        lower, upper = np.maximum(lower, 0), np.minimum(upper, self.distance.shape)
+        to_pixel = view.calibration @ view.rotation.T
+        _integrate(
+            self.distance,
+            self.weight,
+            self.color,
+            depth,
+            weight,
+            color,
+            (to_pixel * self.voxel).astype(np.float32),
+            (to_pixel @ (self.origin - view.position)).astype(np.float32),
+            lower,
+            upper,
+            np.float32(farthest),
+            np.float32(self.truncation),
+        )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cut(first: float, last: float, constant: float, slope: float) -> tuple[float, float]:
+    """The part of [first, last] in which ``constant + slope * k >= 0``."""
+    if slope > 0:
+        return max(first, -constant / slope), last
+    if slope < 0:
+        return first, min(last, -constant / slope)
+    return (first, last) if constant >= 0 else (first, first - 1.0)
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _integrate(
+    distance: NDArray[np.float32],
+    total_weight: NDArray[np.float32],
+    total_color: NDArray[np.uint8],
+    depth: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    color: NDArray[np.uint8],
+    step: NDArray[np.float32],
+    start: NDArray[np.float32],
+    lower: NDArray[np.int64],
+    upper: NDArray[np.int64],
+    farthest: np.float32,
+    truncation: np.float32,
+) -> None:
+    """``start + step @ (i, j, k)`` is a voxel's homogeneous pixel index, its last entry the depth in metres."""
+    height, width = depth.shape
+    half, nearest = np.float32(0.5), np.float32(0.05)
+    right, bottom = np.float32(width - 0.51), np.float32(height - 0.51)
+    step_u, step_v, step_z = step[0, 2], step[1, 2], step[2, 2]
+    for i in range(lower[0], upper[0]):
+        for j in range(lower[1], upper[1]):
+            base_u = start[0] + step[0, 0] * i + step[0, 1] * j
+            base_v = start[1] + step[1, 0] * i + step[1, 1] * j
+            base_z = start[2] + step[2, 0] * i + step[2, 1] * j
+            # The column's part inside the view, so that the loop below needs no bounds.
+            first, last = _cut(float(lower[2]), float(upper[2] - 1), base_z - nearest, step_z)
+            first, last = _cut(first, last, farthest - base_z, -step_z)
+            first, last = _cut(first, last, base_u + half * base_z, step_u + half * step_z)
+            first, last = _cut(first, last, base_v + half * base_z, step_v + half * step_z)
+            first, last = _cut(first, last, right * base_z - base_u, right * step_z - step_u)
+            first, last = _cut(first, last, bottom * base_z - base_v, bottom * step_z - step_v)
+            for k in range(int(np.ceil(first)), int(np.floor(last)) + 1):
+                z = base_z + step_z * k
+                inverse = np.float32(1) / z
+                column = int(min(max((base_u + step_u * k) * inverse + half, np.float32(0)), np.float32(width - 1)))
+                row = int(min(max((base_v + step_v * k) * inverse + half, np.float32(0)), np.float32(height - 1)))
+                measured = depth[row, column]
+                signed = measured - z
+                if measured <= np.float32(0) or signed < -truncation:
+                    continue
+                gain = weight[row, column]
+                old = total_weight[i, j, k]
+                share = gain / (old + gain)
+                distance[i, j, k] += (min(signed, truncation) - distance[i, j, k]) * share
+                total_weight[i, j, k] = min(old + gain, np.float32(WEIGHT_MAX))
+                if signed < truncation:
+                    # Black is the colour of a voxel that so far was only seen through.
+                    blank = (
+                        total_color[i, j, k, 0] == 0 and total_color[i, j, k, 1] == 0 and total_color[i, j, k, 2] == 0
+                    )
+                    blend = np.float32(1) if blank else share
+                    for channel in range(3):
+                        kept = np.float32(total_color[i, j, k, channel])
+                        shade = kept + (np.float32(color[row, column, channel]) - kept) * blend
+                        total_color[i, j, k, channel] = np.uint8(shade + half)

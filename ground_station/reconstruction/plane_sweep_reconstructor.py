@@ -1,0 +1,188 @@
+"""The default reconstructor: depth from images alone, on the CPU, as fast as the drones photograph.
+
+A keyframe is compared with views before and after it on its drone's path and with any other drone's. So it waits for
+`LOOK_AHEAD` further keyframes before its depth is computed, and for as many again, whose depth must confirm its own,
+before it is fused. What is done when depends on the keyframes given alone, never on how fast a thread was.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ground_station.reconstruction.consistency import agreements
+from ground_station.reconstruction.depth_map import DepthEstimator, DepthMap
+from ground_station.reconstruction.depth_range import DepthRange, depth_range
+from ground_station.reconstruction.fusion import Volume
+from ground_station.reconstruction.reconstructor import Keyframe, Mesh, Outcome, Refusal, Statistics
+from ground_station.reconstruction.source_views import ViewIndex
+from ground_station.reconstruction.surface_nets import extract_mesh
+from ground_station.reconstruction.views import CONTRAST_MIN, SHARPNESS_MIN, View, contrast, sharpness, shrink, to_grey
+from protocol.mission import Mission
+
+LOOK_AHEAD: Final = 3
+"""Later keyframes of the same drone that a keyframe waits for; 3 x 0.12 m is the widest useful baseline."""
+PATIENCE_S: Final = 3.0
+"""Mission time after which a hovering drone's last keyframes are used without later ones."""
+VIEWS_KEPT: Final = 2048
+"""Newest keyframes that others may be compared with; 46 kB each at 128 x 72."""
+TYPICAL_SHARE: Final = 0.6
+"""Depth at which triangulation angles are rated, as a share of the empty box's: high things are the hard ones."""
+BYTES_PER_PIXEL: Final = 12
+"""Of a kept keyframe: grey, color, depth and score."""
+AGREEMENTS_MIN: Final = 1
+"""Other views that must confirm a depth."""
+CONFIRMED_MIN: Final = 0.4
+"""Least share of the depths found that others confirm; living room: 0.7 to 0.98, with images swapped at most 0.36.
+Below it the pose is wrong, and what was confirmed is chance."""
+WEIGHT_MIN: Final = 0.3
+"""Weight from which a voxel is part of the map; a good view from 1 m weighs 0.9, from 2 m 0.2."""
+
+
+@dataclass(slots=True, eq=False)
+class _Entry:
+    """A keyframe on its way into the map."""
+
+    drone: int
+    sequence: int
+    tick: int
+    rank: int
+    """Number of the drone's keyframes that were taken in before it."""
+    view: View
+    color: NDArray[np.uint8]
+    span: DepthRange
+    sources: tuple[_Entry, ...] = ()
+    depth: Future[DepthMap] | None = None
+
+
+class PlaneSweepReconstructor:
+    """Implements `reconstructor.Reconstructor`."""
+
+    def __init__(self, mission: Mission) -> None:
+        settings = mission.reconstruction
+        self._settings = settings
+        self._box = mission.target
+        self._width = settings.sweep_width_px
+        self._height = round(settings.sweep_width_px * mission.camera.height_px / mission.camera.width_px)
+        self._patience = round(PATIENCE_S / mission.tick_s)
+        self._estimator = DepthEstimator(self._width, self._height, settings)
+        self._pool = ThreadPoolExecutor(settings.workers, thread_name_prefix="depth")
+        self._volume = Volume(mission.target, settings.voxel_m, settings.truncation_m)
+        self._index = ViewIndex(VIEWS_KEPT)
+        self._kept: list[_Entry | None] = [None] * VIEWS_KEPT
+        self._unswept: list[_Entry] = []
+        self._unfused: list[_Entry] = []
+        self._due: list[_Entry] = []
+        self._decided: list[Outcome] = []
+        self._taken: Counter[int] = Counter()
+        self._newest: dict[int, _Entry] = {}
+        self._received = 0
+        self._fused = 0
+        self._refused: Counter[Refusal] = Counter()
+
+    def add(self, keyframes: Sequence[Keyframe]) -> tuple[Outcome, ...]:
+        self._fuse_due()  # depth maps begun by the call before, computed while the caller was away
+        outcomes = [self._admit(keyframe) for keyframe in keyframes]
+        self._schedule()
+        return (*outcomes, *self._take_decided())
+
+    def flush(self) -> tuple[Outcome, ...]:
+        self._schedule(everything=True)
+        self._fuse_due()
+        return self._take_decided()
+
+    def mesh(self) -> Mesh:
+        self._fuse_due()
+        return extract_mesh(self._volume, WEIGHT_MIN)
+
+    def statistics(self) -> Statistics:
+        kept = len(self._index) * self._width * self._height * BYTES_PER_PIXEL
+        return Statistics(
+            received=self._received,
+            fused=self._fused,
+            waiting=self._received - self._fused - self._refused.total(),
+            refused=dict(self._refused),
+            memory_bytes=self._volume.size_bytes + kept,
+        )
+
+    def _admit(self, keyframe: Keyframe) -> Outcome:
+        """Keep what later steps need of a keyframe, unless it is of no use."""
+        self._received += 1
+        color = shrink(keyframe.image, self._width, self._height)
+        camera = keyframe.intrinsics.scaled_to(self._width, self._height)
+        view = View(to_grey(color), keyframe.position, keyframe.rotation, camera)
+        span = depth_range(view, self._box, self._settings.truncation_m)
+        last = self._newest.get(keyframe.drone)
+        if last and (keyframe.tick <= last.tick or np.array_equal(view.grey, last.view.grey)):
+            return self._refuse(keyframe, "repeated")
+        if contrast(view.grey) < CONTRAST_MIN:
+            return self._refuse(keyframe, "featureless")
+        if sharpness(view.grey) < SHARPNESS_MIN:
+            return self._refuse(keyframe, "blurred")
+        if span is None or span.nearest > self._settings.farthest_m or span.farthest < self._settings.nearest_m:
+            return self._refuse(keyframe, "off_target")
+        entry = _Entry(keyframe.drone, keyframe.sequence, keyframe.tick, self._taken[keyframe.drone], view, color, span)
+        self._taken[keyframe.drone] += 1
+        self._newest[keyframe.drone] = entry
+        self._kept[self._index.add(view)] = entry
+        self._unswept.append(entry)
+        return Outcome(keyframe.drone, keyframe.sequence, "waiting")
+
+    def _schedule(self, everything: bool = False) -> None:
+        """Begin the depth maps that are due, and note what can be fused once they are there."""
+        now = max((entry.tick for entry in self._newest.values()), default=0)
+
+        def is_due(entry: _Entry, stages: int) -> bool:
+            followed = self._taken[entry.drone] - 1 - entry.rank >= stages * LOOK_AHEAD
+            return everything or followed or now - entry.tick >= stages * self._patience
+
+        for entry in [entry for entry in self._unswept if is_due(entry, 1)]:
+            self._unswept.remove(entry)
+            entry.sources = self._sources(entry.view, entry.span)
+            if not entry.sources:
+                self._decided.append(self._refuse(entry, "no_overlap"))
+                continue
+            views = [source.view for source in entry.sources]
+            entry.depth = self._pool.submit(self._estimator.estimate, entry.view, views, entry.span)
+            self._unfused.append(entry)
+        ready = [entry for entry in self._unfused if is_due(entry, 2)]
+        self._unfused = [entry for entry in self._unfused if not is_due(entry, 2)]
+        self._due.extend(ready)
+
+    def _sources(self, view: View, span: DepthRange) -> tuple[_Entry, ...]:
+        depth = min(TYPICAL_SHARE * span.typical, self._settings.farthest_m)
+        slots = self._index.sources(view, depth, self._settings.sources)
+        return tuple(entry for slot in slots if (entry := self._kept[slot]) is not None)
+
+    def _fuse_due(self) -> None:
+        """Average the depth that other views confirm into the volume, in the order in which keyframes came due."""
+        for entry in self._due:
+            assert entry.depth is not None
+            found = entry.depth.result()
+            others = [(source.view, source.depth.result().depth) for source in entry.sources if source.depth]
+            entry.sources = ()  # else every keyframe would keep all before it alive
+            confirmed = agreements(entry.view, found.depth, others) >= AGREEMENTS_MIN
+            if not confirmed.any() or np.count_nonzero(confirmed) < CONFIRMED_MIN * np.count_nonzero(found.depth):
+                self._decided.append(self._refuse(entry, "no_depth"))
+                continue
+            depth = np.where(confirmed, found.depth, np.float32(0))
+            weight = found.score / np.maximum(found.depth, np.float32(self._settings.nearest_m)) ** 2
+            self._volume.integrate(entry.view, depth, weight, entry.color)
+            self._fused += 1
+            self._decided.append(Outcome(entry.drone, entry.sequence, "fused"))
+        self._due.clear()
+
+    def _refuse(self, keyframe: Keyframe | _Entry, reason: Refusal) -> Outcome:
+        self._refused[reason] += 1
+        return Outcome(keyframe.drone, keyframe.sequence, "refused", reason)
+
+    def _take_decided(self) -> tuple[Outcome, ...]:
+        decided = tuple(self._decided)
+        self._decided.clear()
+        return decided

@@ -1,0 +1,128 @@
+"""What turns keyframes into a map, seen from the ground station: the one interface all methods share.
+
+A keyframe is not always used at once: most methods wait for views from further along the path. `Reconstructor.add`
+therefore reports two kinds of outcome, of the keyframes just given and of earlier ones whose fate is now known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal, Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.errors import ReconstructionError
+from protocol.geometry import Floats, Intrinsics
+
+ROTATION_TOLERANCE: Final = 1e-4
+"""Largest error of an entry of R R^T: float32 on the wire leaves 1e-6."""
+
+Refusal: TypeAlias = Literal["repeated", "featureless", "blurred", "off_target", "no_overlap", "no_depth"]
+"""``repeated``: not newer than the drone's last, or the same image again (a frozen camera would ruin the map).
+``featureless``: black, white or covered. ``off_target``: looks past the box to be mapped. ``no_overlap``: no other
+keyframe shows the same place from a useful angle. ``no_depth``: compared, but no depth that two views agree on."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Keyframe:
+    """Raises `ReconstructionError` if the image or the pose is impossible."""
+
+    drone: int
+    sequence: int
+    """Counts the drone's keyframes."""
+    tick: int
+    """Mission tick of the exposure."""
+    image: NDArray[np.uint8]
+    """(H, W, 3) RGB."""
+    position: Floats
+    """(3,) m, camera centre, world."""
+    rotation: Floats
+    """(3, 3), camera to world (`protocol.geometry`)."""
+    intrinsics: Intrinsics
+    """Of ``image``."""
+
+    def __post_init__(self) -> None:
+        name = f"keyframe {self.sequence} of drone {self.drone}"
+        size = (self.intrinsics.height, self.intrinsics.width, 3)
+        if self.image.dtype != np.uint8 or self.image.shape != size:
+            raise ReconstructionError(f"{name}: image is {self.image.dtype} {self.image.shape}, expected uint8 {size}")
+        if self.position.shape != (3,) or self.rotation.shape != (3, 3):
+            raise ReconstructionError(f"{name}: pose has shapes {self.position.shape} and {self.rotation.shape}")
+        if not (np.isfinite(self.position).all() and np.isfinite(self.rotation).all()):
+            raise ReconstructionError(f"{name}: pose is not finite")
+        skew = np.abs(self.rotation @ self.rotation.T - np.eye(3)).max()
+        if skew > ROTATION_TOLERANCE or np.linalg.det(self.rotation) < 0:
+            raise ReconstructionError(f"{name}: rotation is not a right-handed orthonormal matrix")
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    drone: int
+    sequence: int
+    state: Literal["waiting", "fused", "refused"]
+    reason: Refusal | None = None
+    """Given when refused."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mesh:
+    vertices: NDArray[np.float32]
+    """(V, 3) m, world."""
+    faces: NDArray[np.int32]
+    """(F, 3) vertex numbers, counter-clockwise seen from the front."""
+    colors: NDArray[np.uint8]
+    """(V, 3) RGB."""
+
+    @classmethod
+    def empty(cls) -> Mesh:
+        return cls(np.empty((0, 3), np.float32), np.empty((0, 3), np.int32), np.empty((0, 3), np.uint8))
+
+
+@dataclass(frozen=True, slots=True)
+class Statistics:
+    received: int
+    fused: int
+    waiting: int
+    refused: Mapping[Refusal, int]
+    memory_bytes: int
+    """Of the map and the keyframes kept."""
+
+
+class Reconstructor(Protocol):
+    """Used from one thread. The mesh is a function of the keyframes given so far and their order, of nothing else."""
+
+    def add(self, keyframes: Sequence[Keyframe]) -> tuple[Outcome, ...]:
+        """Take in keyframes, oldest first; one outcome for each, and one for every earlier one decided since."""
+        ...
+
+    def flush(self) -> tuple[Outcome, ...]:
+        """Decide all that still wait, with the views there are: the end of the mission, or of a leg."""
+        ...
+
+    def mesh(self) -> Mesh:
+        """Of all that is decided by now; may be empty. The arrays are the caller's."""
+        ...
+
+    def statistics(self) -> Statistics: ...
+
+
+class NullReconstructor:
+    """Makes no map: missions that only fly."""
+
+    def __init__(self) -> None:
+        self._received = 0
+
+    def add(self, keyframes: Sequence[Keyframe]) -> tuple[Outcome, ...]:
+        self._received += len(keyframes)
+        return tuple(Outcome(keyframe.drone, keyframe.sequence, "fused") for keyframe in keyframes)
+
+    def flush(self) -> tuple[Outcome, ...]:
+        return ()
+
+    def mesh(self) -> Mesh:
+        return Mesh.empty()
+
+    def statistics(self) -> Statistics:
+        return Statistics(self._received, self._received, 0, {}, 0)

@@ -1,0 +1,69 @@
+"""Takes the simulated drones' keyframes: when they are due, rendered, made noisy, and compressed as a camera would."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image
+
+from protocol.geometry import Floats, camera_rotation
+from protocol.keyframe_rule import KeyframeRule
+from protocol.messages import Keyframe
+from protocol.mission import Mission
+from sim_bridge.camera import Camera, add_noise
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """A keyframe that is due but not rendered yet."""
+
+    drone: int
+    sequence: int
+    tick: int
+    pose: Floats
+
+
+class Photographer:
+    def __init__(self, mission: Mission, camera: Camera) -> None:
+        self._mission, self._camera = mission, camera
+        self._intrinsics = mission.camera.intrinsics()
+        self._rules = {drone.id: KeyframeRule(mission.camera) for drone in mission.drones}
+        self._taken = dict.fromkeys(self._rules, 0)
+
+    def due(self, tick: int, poses: Mapping[int, Floats]) -> list[Shot]:
+        """The drones, ascending, whose camera has moved enough since its last keyframe; ``poses`` are (5,)."""
+        shots = []
+        for drone, pose in sorted(poses.items()):
+            if self._rules[drone].wants(pose[:3], camera_rotation(pose[3], pose[4])):
+                shots.append(Shot(drone, self._taken[drone], tick, pose.copy()))
+                self._taken[drone] += 1
+        return shots
+
+    def take(self, shot: Shot) -> Keyframe:
+        """Render one; the noise depends on the mission's seed, the drone and the sequence number alone."""
+        settings = self._mission.camera
+        image = self._camera.render(shot.pose)
+        if self._mission.simulation.image_noise > 0:
+            generator = np.random.default_rng([self._mission.seed, shot.drone, shot.sequence])
+            image = add_noise(image, self._mission.simulation.image_noise, generator)
+        jpeg = io.BytesIO()
+        Image.fromarray(image).save(jpeg, "JPEG", quality=settings.jpeg_quality)
+        rotation = camera_rotation(shot.pose[3], shot.pose[4])
+        intrinsics = self._intrinsics
+        return Keyframe(
+            drone=shot.drone,
+            sequence=shot.sequence,
+            tick=shot.tick,
+            position=tuple(shot.pose[:3].tolist()),
+            rotation=tuple(tuple(row) for row in rotation.tolist()),
+            width=intrinsics.width,
+            height=intrinsics.height,
+            fx=intrinsics.fx,
+            fy=intrinsics.fy,
+            cx=intrinsics.cx,
+            cy=intrinsics.cy,
+            jpeg=jpeg.getvalue(),
+        )

@@ -1,0 +1,196 @@
+"""The simulated world's process: vehicles, cameras and the mission's clock.
+
+Lockstep: tick k is published, keyframes are rendered while the agents think, and the world steps once every live
+agent has answered and the ground station is done up to tick k + 1. Real time: ticks follow the machine's clock and
+nobody is waited for. No check is different in simulation (safety rule 3).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from protocol import topics
+from protocol.bus import Bus, connect
+from protocol.errors import ProcessError
+from protocol.messages import JumpHead, Setpoint, Tick, VehicleSample
+from protocol.mission import Mission
+from sim_bridge.dynamics import VehicleBody
+
+if TYPE_CHECKING:
+    from sim_bridge.photographer import Photographer, Shot
+
+log = logging.getLogger(__name__)
+
+START_PATIENCE_S = 120.0
+"""For all processes to import, compile and connect on a slow machine."""
+LOCKSTEP_PATIENCE_S = 10.0
+"""An agent that has not answered for so long is flown around: its vehicle brakes, the others go on."""
+GROUND_PATIENCE_S = 120.0
+"""The ground station may be busy reconstructing; only its death or this ends the run."""
+CHECK_S = 0.5
+CAMERA_BACKLOG = 64
+"""Keyframes that may wait to be rendered in real time; beyond it they are lost and counted."""
+
+
+class Simulator:
+    def __init__(self, mission: Mission, bus: Bus, photographer: Photographer | None, *, lockstep: bool) -> None:
+        self._mission, self._bus, self._photographer, self._lockstep = mission, bus, photographer, lockstep
+        self._bodies = {drone.id: VehicleBody.at(np.array(drone.start)) for drone in mission.drones}
+        self._answered = dict.fromkeys(self._bodies, -1)
+        self._silent: set[int] = set()
+        self._head = JumpHead(epoch=0, next_sequence=0, done=0, phase="starting")
+        self._keyframes = 0
+        self._lost_keyframes = 0
+        self._camera = ThreadPoolExecutor(1, thread_name_prefix="camera")
+        self._rendering: set[asyncio.Task[None]] = set()
+        bus.on(topics.SETPOINT, self._hear_setpoint)
+        bus.on(topics.HEAD, self._hear_head)
+        bus.watch_lives()
+
+    def _hear_setpoint(self, setpoint: Setpoint) -> None:
+        body = self._bodies.get(setpoint.drone)
+        if body is None:
+            return
+        time_s = setpoint.tick * self._mission.tick_s
+        body.command(np.array(setpoint.velocity), time_s, self._mission.flight)
+        self._answered[setpoint.drone] = max(self._answered[setpoint.drone], setpoint.tick)
+        self._silent.discard(setpoint.drone)
+
+    def _hear_head(self, head: JumpHead) -> None:
+        self._head = head
+
+    async def run(self) -> None:
+        """Until the ground station says that the mission is finished.
+
+        Raises:
+            ProcessError: somebody did not appear, or the ground station died.
+        """
+        self._bus.announce("sim")
+        await self._wait_for_everybody()
+        loop = asyncio.get_running_loop()
+        began, tick = loop.time(), 0
+        try:
+            while self._head.phase != "finished":
+                self._publish(tick)
+                await self._photograph(tick)
+                if self._lockstep:
+                    await self._wait_for_agents(tick)
+                    await self._wait_for_ground(tick + 1)
+                else:
+                    await asyncio.sleep(max(0.0, began + (tick + 1) * self._mission.tick_s - loop.time()))
+                    self._require_ground()
+                for body in self._bodies.values():
+                    body.step(self._mission.tick_s, tick * self._mission.tick_s, self._mission.flight)
+                tick += 1
+        finally:
+            self._camera.shutdown(cancel_futures=True)
+        if self._lost_keyframes:
+            log.warning("%d keyframes were due faster than they could be rendered and are lost", self._lost_keyframes)
+
+    async def _wait_for_everybody(self) -> None:
+        wanted = {"ground", *(f"drone/{drone}" for drone in self._bodies)}
+        if not await self._bus.until(lambda: wanted <= self._bus.alive, START_PATIENCE_S):
+            missing = ", ".join(sorted(wanted - self._bus.alive))
+            raise ProcessError(f"not started within {START_PATIENCE_S:g} s: {missing}")
+
+    def _live(self) -> list[int]:
+        return [drone for drone in sorted(self._bodies) if self._is_live(drone)]
+
+    def _is_live(self, drone: int) -> bool:
+        return drone not in self._silent and f"drone/{drone}" in self._bus.alive
+
+    def _publish(self, tick: int) -> None:
+        if not self._lockstep:
+            oldest = tick - topics.SETPOINT.max_age_s / self._mission.tick_s
+            self._silent = {drone for drone, answered in self._answered.items() if answered < oldest}
+        vehicles = [
+            VehicleSample(
+                drone=drone, pose=tuple(body.pose.tolist()), velocity=tuple(body.velocity.tolist()), battery=1.0
+            )
+            for drone, body in sorted(self._bodies.items())
+        ]
+        beat = Tick(
+            tick=tick,
+            time_s=tick * self._mission.tick_s,
+            lockstep=self._lockstep,
+            live=tuple(self._live()),
+            vehicles=tuple(vehicles),
+            jump_epoch=self._head.epoch,
+            next_jump=self._head.next_sequence,
+            keyframes=self._keyframes,
+        )
+        self._bus.put(topics.TICK, beat)
+
+    async def _photograph(self, tick: int) -> None:
+        if self._photographer is None:
+            return
+        shots = self._photographer.due(tick, {drone: body.pose for drone, body in self._bodies.items()})
+        if self._lockstep:
+            for shot in shots:
+                await self._shoot(self._photographer, shot)
+            return
+        for shot in shots:
+            if len(self._rendering) >= CAMERA_BACKLOG:
+                self._lost_keyframes += 1
+                continue
+            task = asyncio.create_task(self._shoot(self._photographer, shot))
+            self._rendering.add(task)
+            task.add_done_callback(self._rendering.discard)
+
+    async def _shoot(self, photographer: Photographer, shot: Shot) -> None:
+        keyframe = await asyncio.get_running_loop().run_in_executor(self._camera, photographer.take, shot)
+        self._bus.put(topics.KEYFRAME, keyframe, shot.drone)
+        self._keyframes += 1
+
+    async def _wait_for_agents(self, tick: int) -> None:
+        def answered() -> bool:
+            return all(self._answered[drone] >= tick for drone in self._live())
+
+        if not await self._bus.until(answered, LOCKSTEP_PATIENCE_S):
+            late = {drone for drone in self._live() if self._answered[drone] < tick}
+            log.error("tick %d: no answer from drones %s: going on without them", tick, sorted(late))
+            self._silent |= late
+
+    async def _wait_for_ground(self, tick: int) -> None:
+        for _ in range(int(GROUND_PATIENCE_S / CHECK_S)):
+            done = await self._bus.until(lambda: self._head.done >= tick or self._head.phase == "finished", CHECK_S)
+            if done:
+                return
+            self._require_ground()
+        raise ProcessError(f"tick {tick}: the ground station is not done after {GROUND_PATIENCE_S:g} s")
+
+    def _require_ground(self) -> None:
+        if "ground" not in self._bus.alive and self._head.phase != "finished":
+            raise ProcessError("the ground station is gone")
+
+
+async def run_simulator(mission: Mission, endpoint: str, run: Path, *, lockstep: bool) -> None:
+    """Simulate the world of ``mission``; what is true of it is left in the run folder."""
+    photographer = await asyncio.to_thread(_make_photographer, mission, run)
+    async with connect(endpoint, mission.name, lossless=lockstep) as bus:
+        await Simulator(mission, bus, photographer, lockstep=lockstep).run()
+
+
+def _make_photographer(mission: Mission, run: Path) -> Photographer | None:
+    """Load the scene, leave its truth in the run folder, and warm the camera up; None for a mission without a scene."""
+    if not mission.simulation.scene:
+        return None
+    # Heavy modules that a simulator without a scene does not need.
+    from sim_bridge.camera import Camera
+    from sim_bridge.photographer import Photographer
+    from sim_bridge.scenes.cache import scene_cache
+    from sim_bridge.scenes.scene import load_scene
+    from sim_bridge.scenes.truth import write_truth
+
+    cache = scene_cache()
+    scene = load_scene(mission.simulation.scene, relative_to=run, cache=cache, on_progress=log.info)
+    write_truth(scene, mission, run, cache=cache)
+    camera = Camera(scene, mission.camera.intrinsics())
+    camera.render(mission.drones[0].start)
+    return Photographer(mission, camera)

@@ -1,0 +1,278 @@
+"""What the ground station may expect of any reconstructor, and what the default one finds of two boxes on a floor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ground_station.reconstruction.backends import make_reconstructor
+from ground_station.reconstruction.reconstructor import Keyframe, Mesh, Outcome, Reconstructor
+from protocol.errors import ReconstructionError
+from protocol.geometry import Floats, Intrinsics, camera_rotation
+from protocol.mission import Camera, Drone, Mission, Reconstruction, Target
+
+CAMERA = Camera(width_px=160, height_px=90)
+BOXES = (((-0.45, -0.35, 0.0), (0.05, 0.25, 0.35)), ((0.4, -0.2, 0.0), (0.8, 0.4, 0.5)))
+HIGHEST = 0.5
+"""m, top of the taller box."""
+SETTINGS = Reconstruction(sweep_width_px=96, depth_planes=32, nearest_m=0.6, farthest_m=2.5)
+LEG = 14
+"""Keyframes of one drone's flight over the boxes."""
+
+
+def mission(backend: str = "plane_sweep", workers: int = 1) -> Mission:
+    return Mission(
+        target=Target(lower_m=(-1, -1, 0), upper_m=(1, 1, 0.8)),
+        camera=CAMERA,
+        reconstruction=SETTINGS.model_copy(update={"backend": backend, "workers": workers}),
+        drones=(Drone(id=1, start=(0, 0, 2, 0, 1.4)),),
+    )
+
+
+def texture(x: Floats, y: Floats) -> Floats:
+    rng = np.random.default_rng(3)
+    total = np.full_like(x, 128.0)
+    for _ in range(24):
+        direction, phase = rng.uniform(0, 2 * np.pi, 2)
+        wave = 2 * np.pi / (0.05 * 10 ** rng.uniform(0, 1))
+        total += 14 * np.sin(wave * (x * np.cos(direction) + y * np.sin(direction)) + phase)
+    return total
+
+
+def photograph(position: Floats, rotation: Floats, camera: Intrinsics) -> NDArray[np.uint8]:
+    """RGB image of the floor z = 0 and the boxes; (H, W, 3)."""
+    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones_like(rows)], axis=-1)
+    rays = rays @ rotation.T
+    depth, side = -position[2] / rays[..., 2], np.full(rows.shape, 2)
+    for lower, upper in BOXES:
+        one, two = (np.array(lower) - position) / rays, (np.array(upper) - position) / rays
+        entry = np.minimum(one, two)
+        hit = (entry.max(axis=-1) < np.maximum(one, two).min(axis=-1)) & (entry.max(axis=-1) > 0)
+        depth, side = np.where(hit, entry.max(axis=-1), depth), np.where(hit, entry.argmax(axis=-1), side)
+    points = position + depth[..., None] * rays
+    across = np.where(side == 0, points[..., 1], points[..., 0])
+    along = np.where(side == 2, points[..., 1] + points[..., 2], points[..., 2] + 7.0)
+    grey = np.clip(texture(across, along), 0, 255)
+    return np.stack([grey, 0.8 * grey, 0.6 * grey], axis=-1).astype(np.uint8)
+
+
+def keyframe(sequence: int, x: float, y: float, drone: int = 1, yaw: float = 0.0) -> Keyframe:
+    position = np.array([x, y, 1.4 + 0.05 * np.sin(sequence)])
+    rotation = camera_rotation(yaw + 0.1 * np.sin(2.0 * sequence), 1.35 + 0.1 * np.sin(sequence))
+    camera = CAMERA.intrinsics()
+    return Keyframe(drone, sequence, 5 * sequence, photograph(position, rotation, camera), position, rotation, camera)
+
+
+@pytest.fixture(scope="module")
+def flight() -> list[Keyframe]:
+    """Two drones on parallel lines over the boxes, their keyframes interleaved as they arrive."""
+    pairs = [
+        (keyframe(n, -0.8 + 0.12 * n, -0.1), keyframe(n, 0.8 - 0.12 * n, 0.15, drone=2, yaw=2.0)) for n in range(LEG)
+    ]
+    return [one for pair in pairs for one in pair]
+
+
+def fly(reconstructor: Reconstructor, flight: Sequence[Keyframe]) -> list[Outcome]:
+    outcomes: list[Outcome] = []
+    for start in range(0, len(flight), 2):
+        outcomes += reconstructor.add(flight[start : start + 2])
+    return [*outcomes, *reconstructor.flush()]
+
+
+def assert_sound(mesh: Mesh) -> None:
+    assert [array.dtype.name for array in (mesh.vertices, mesh.faces, mesh.colors)] == ["float32", "int32", "uint8"]
+    assert mesh.vertices.shape[1] == mesh.faces.shape[1] == mesh.colors.shape[1] == 3
+    assert len(mesh.colors) == len(mesh.vertices)
+    assert np.isfinite(mesh.vertices).all()
+    assert mesh.faces.size == 0 or (mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices))
+
+
+def contents(mesh: Mesh) -> tuple[bytes, bytes, bytes]:
+    return mesh.vertices.tobytes(), mesh.faces.tobytes(), mesh.colors.tobytes()
+
+
+def blurred(sharp: Keyframe) -> Keyframe:
+    """Motion blur along the image's rows, a seventh of its width."""
+    image = np.mean([np.roll(sharp.image, shift, axis=1) for shift in range(23)], axis=0).astype(np.uint8)
+    return replace(sharp, image=image)
+
+
+@pytest.fixture(params=["plane_sweep", "none"])
+def reconstructor(request: pytest.FixtureRequest) -> Reconstructor:
+    return make_reconstructor(mission(request.param))
+
+
+def test_a_new_reconstructor_has_an_empty_mesh_and_nothing_to_flush(reconstructor: Reconstructor) -> None:
+    assert_sound(reconstructor.mesh())
+    assert reconstructor.mesh().faces.size == 0
+    assert reconstructor.add([]) == ()
+    assert reconstructor.flush() == ()
+    assert reconstructor.statistics().received == 0
+
+
+def test_every_keyframe_is_decided_exactly_once(reconstructor: Reconstructor, flight: list[Keyframe]) -> None:
+    outcomes = fly(reconstructor, flight)
+    decided = [(outcome.drone, outcome.sequence) for outcome in outcomes if outcome.state != "waiting"]
+    assert sorted(decided) == sorted((one.drone, one.sequence) for one in flight)
+    statistics = reconstructor.statistics()
+    assert statistics.received == len(flight)
+    assert statistics.waiting == 0
+    assert statistics.fused + sum(statistics.refused.values()) == len(flight)
+
+
+def test_each_given_keyframe_gets_an_outcome_at_once(reconstructor: Reconstructor, flight: list[Keyframe]) -> None:
+    for one in flight[:6]:
+        outcome = reconstructor.add([one])[0]
+        assert (outcome.drone, outcome.sequence) == (one.drone, one.sequence)
+
+
+def test_bad_images_are_survived(reconstructor: Reconstructor, flight: list[Keyframe]) -> None:
+    first = flight[0]
+    tiny = Intrinsics.from_field_of_view(8, 6, 1.287)
+    bad = [
+        replace(first, image=np.zeros_like(first.image)),
+        replace(first, sequence=1, tick=1, image=np.full_like(first.image, 255)),
+        replace(blurred(first), sequence=2, tick=2),
+        replace(first, sequence=3, tick=3),
+        replace(first, sequence=4, tick=4),
+        replace(first, sequence=5, tick=5, image=first.image[:6, :8], intrinsics=tiny),
+        replace(first, sequence=6, tick=6, image=flight[2].image, position=np.array([90.0, 0.0, 1.0])),
+        replace(first, sequence=7, tick=7, image=flight[4].image, rotation=camera_rotation(0.0, -1.5)),
+    ]
+    fly(reconstructor, bad)
+    assert_sound(reconstructor.mesh())
+
+
+def test_a_mesh_belongs_to_the_caller(reconstructor: Reconstructor, flight: list[Keyframe]) -> None:
+    fly(reconstructor, flight)
+    before = contents(reconstructor.mesh())
+    spoiled = reconstructor.mesh()
+    spoiled.vertices[:] = np.nan
+    spoiled.faces[:] = -1
+    assert contents(reconstructor.mesh()) == before
+
+
+def test_keyframes_may_follow_a_flush(reconstructor: Reconstructor, flight: list[Keyframe]) -> None:
+    fly(reconstructor, flight[:16])
+    fly(reconstructor, flight[16:])
+    assert reconstructor.statistics().waiting == 0
+    assert_sound(reconstructor.mesh())
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"position": np.array([0.0, np.nan, 1.0])}, "not finite"),
+        ({"position": np.zeros(2)}, "shapes"),
+        ({"rotation": np.diag([1.0, 1.0, -1.0])}, "right-handed"),
+        ({"rotation": 2.0 * np.eye(3)}, "orthonormal"),
+        ({"image": np.zeros((90, 90, 3), np.uint8)}, "image"),
+        ({"image": np.zeros((90, 160, 3), np.float32)}, "image"),
+    ],
+)
+def test_an_impossible_keyframe_cannot_be_made(
+    flight: list[Keyframe], change: dict[str, Floats], complaint: str
+) -> None:
+    with pytest.raises(ReconstructionError, match=complaint):
+        replace(flight[0], **change)  # type: ignore[arg-type]  # wrong on purpose
+
+
+# What follows holds for the plane sweep alone.
+
+
+@pytest.fixture(scope="module")
+def boxes(flight: list[Keyframe]) -> Mesh:
+    reconstructor = make_reconstructor(mission())
+    fly(reconstructor, flight)
+    return reconstructor.mesh()
+
+
+def test_the_boxes_and_the_floor_are_found_where_they_are(boxes: Mesh) -> None:
+    assert_sound(boxes)
+    inside = boxes.vertices[np.abs(boxes.vertices[:, :2]).max(axis=1) < 0.9].astype(float)
+    away = np.abs(inside[:, 2])
+    for lower, upper in BOXES:
+        outside = np.maximum(np.maximum(np.array(lower) - inside, inside - np.array(upper)), 0.0)
+        depth = np.minimum(inside - np.array(lower), np.array(upper) - inside).min(axis=1)
+        away = np.minimum(away, np.maximum(np.linalg.norm(outside, axis=1), depth))
+    assert np.mean(away < 0.025) > 0.9
+    for lower, upper in BOXES:
+        middle = [(low + high) / 2 for low, high in zip(lower[:2], upper[:2], strict=True)]
+        above = np.abs(inside[:, :2] - middle).max(axis=1) < 0.1
+        assert np.median(inside[above, 2]) == pytest.approx(upper[2], abs=0.01)
+
+
+def test_the_mesh_has_the_colors_of_the_images(boxes: Mesh) -> None:
+    shades = boxes.colors.astype(float).mean(axis=0)
+    assert shades[1] / shades[0] == pytest.approx(0.8, abs=0.02)
+    assert shades[2] / shades[0] == pytest.approx(0.6, abs=0.02)
+
+
+def test_the_mesh_does_not_depend_on_workers_or_on_when_it_was_asked_for(boxes: Mesh, flight: list[Keyframe]) -> None:
+    reconstructor = make_reconstructor(mission(workers=2))
+    for start in range(0, len(flight), 2):
+        reconstructor.add(flight[start : start + 2])
+        if start % 3 == 0:
+            reconstructor.mesh()
+    reconstructor.flush()
+    assert contents(reconstructor.mesh()) == contents(boxes)
+
+
+def test_the_map_grows_before_the_flight_ends(flight: list[Keyframe]) -> None:
+    reconstructor = make_reconstructor(mission())
+    for start in range(0, 20, 2):
+        reconstructor.add(flight[start : start + 2])
+    assert len(reconstructor.mesh().faces) > 1000
+
+
+def reasons(outcomes: Sequence[Outcome]) -> dict[int, str]:
+    return {outcome.sequence: outcome.reason for outcome in outcomes if outcome.reason is not None}
+
+
+def test_useless_keyframes_are_refused_with_the_reason(flight: list[Keyframe]) -> None:
+    one, two, three = flight[0], flight[2], flight[4]
+    outcomes = fly(
+        make_reconstructor(mission()),
+        [
+            one,
+            replace(one, sequence=1, tick=0, image=two.image),
+            replace(one, sequence=2, tick=2, position=one.position + 0.1),
+            replace(one, sequence=3, tick=3, image=np.full_like(one.image, 7)),
+            replace(blurred(two), sequence=4, tick=4),
+            replace(three, sequence=5, tick=5, rotation=camera_rotation(0.0, -1.5)),
+            replace(three, sequence=6, tick=6, position=np.array([0.9, 0.9, 1.0])),
+        ],
+    )
+    assert reasons(outcomes) == {
+        0: "no_overlap",
+        1: "repeated",
+        2: "repeated",
+        3: "featureless",
+        4: "blurred",
+        5: "off_target",
+        6: "no_overlap",
+    }
+
+
+def test_views_whose_poses_are_wrong_are_kept_out_of_the_map(flight: list[Keyframe]) -> None:
+    own = flight[::2]
+    swapped = [replace(one, image=own[5 * n % LEG].image) for n, one in enumerate(own)]
+    reconstructor = make_reconstructor(mission())
+    assert set(reasons(fly(reconstructor, swapped)).values()) == {"no_depth"}
+    assert reconstructor.statistics().fused < 3
+
+
+def test_a_hovering_drone_does_not_keep_its_keyframes_waiting(flight: list[Keyframe]) -> None:
+    reconstructor = make_reconstructor(mission())
+    for one in flight[:8]:
+        reconstructor.add([one])
+    assert reconstructor.statistics().fused == 0
+    late = replace(flight[-1], tick=10_000)
+    reconstructor.add([late])
+    outcomes = reconstructor.add([])
+    assert {outcome.sequence for outcome in outcomes} == {0, 1, 2, 3}

@@ -1,0 +1,260 @@
+"""The run folder: what is written can be read back, whenever the writer dies."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from ground_station.evaluation import Score, Scores
+from ground_station.results import Metrics, RunFolder, mesh_sha256, versions
+from protocol.errors import MissionError
+from protocol.mission import Drone, Mission
+
+MISSION = Mission(
+    name="pair",
+    seed=7,
+    drones=(Drone(id=1, start=(0.0, 1.0, 2.0, 0.0, 1.4)), Drone(id=4, start=(0.0, -1.0, 2.0, 0.0, 1.4))),
+)
+SCORES = Scores(visible=Score.of(0.9, 0.8), exposed=Score.of(0.9, 0.7), objects=Score.of(0.85, 0.6))
+FLOOR = Scores(visible=Score.of(1.0, 0.5), exposed=Score.of(1.0, 0.4), objects=Score.of(0.0, 0.0))
+VERTICES = np.array([[0, 0, 0], [1, 0, 0], [1, 2, 0], [0, 2, 3]], np.float32)
+FACES = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+COLOURS = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [128, 128, 128]], np.uint8)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Iterator[RunFolder]:
+    run = RunFolder(tmp_path / "run", MISSION)
+    yield run
+    run.close()
+
+
+def metrics(tick: int, scores: Scores | None = SCORES) -> Metrics:
+    return Metrics(time_s=tick / 20, tick=tick, importance=0.4321, scores=scores, jumps=3, keyframes=42)
+
+
+def fly(run: RunFolder, first: int, last: int) -> None:
+    """Two drones that come nearer by 1 cm a tick; drone 4 falls silent at tick 7 and brakes at every fourth."""
+    for tick in range(first, last):
+        poses = {1: (0.0, 0.0, 2.0, 0.1, 1.2), 4: (3.0 - 0.01 * tick, 0.0, 2.0, 0.2, 1.3)}
+        if tick == 7:
+            del poses[4]
+        fallback = {1: "", 4: "infeasible" if tick % 4 == 0 else ""}
+        run.record_tick(tick, tick / 20, poses, {1: 0.001, 4: 0.002}, {1: 0.0, 4: 0.5}, fallback)
+
+
+def finish(run: RunFolder, tick: int = 10) -> dict[str, object]:
+    run.finish(metrics(tick), floor_baseline=FLOOR, phi_sha256="f" * 64, wall_time_s=2.5, exit_reason="duration")
+    content: dict[str, object] = json.loads((run.path / "summary.json").read_text())
+    return content
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_metrics_rows_can_be_read_while_the_run_goes_on(folder: RunFolder) -> None:
+    fly(folder, 0, 5)
+    folder.record_metrics(metrics(5))
+    (row,) = rows(folder.path / "metrics.csv")
+    assert list(row) == [
+        "time_s", "tick", "importance", "f_score_visible", "f_score_exposed", "f_score_objects", "precision", "recall",
+        "jumps", "keyframes", "min_separation_m", "separation_1_m", "separation_4_m",
+    ]  # fmt: skip
+    assert {key: float(value) for key, value in row.items()} == pytest.approx(
+        {
+            "time_s": 0.25, "tick": 5, "importance": 0.4321, "f_score_visible": SCORES.visible.f,
+            "f_score_exposed": SCORES.exposed.f, "f_score_objects": SCORES.objects.f, "precision": 0.9, "recall": 0.8,
+            "jumps": 3, "keyframes": 42, "min_separation_m": 2.96, "separation_1_m": 2.96, "separation_4_m": 2.96,
+        },
+        abs=1e-6,
+    )  # fmt: skip
+
+
+def test_a_row_shows_the_nearest_approach_since_the_row_before(folder: RunFolder) -> None:
+    for tick, distance in enumerate([5.0, 1.2, 5.0]):
+        folder.record_tick(tick, tick / 20, {1: (0, 0, 1, 0, 1), 4: (distance, 0, 1, 0, 1)}, {}, {}, {})
+    folder.record_metrics(metrics(3))
+    folder.record_tick(3, 0.15, {1: (0, 0, 1, 0, 1), 4: (4.0, 0, 1, 0, 1)}, {}, {}, {})
+    folder.record_metrics(metrics(4))
+    assert [row["min_separation_m"] for row in rows(folder.path / "metrics.csv")] == ["1.2", "4.0"]
+    assert finish(folder)["min_separation_m"] == 1.2
+
+
+def test_what_a_run_does_not_have_stays_empty(tmp_path: Path) -> None:
+    alone = MISSION.model_copy(update={"drones": MISSION.drones[:1]})
+    run = RunFolder(tmp_path, alone)
+    run.record_tick(0, 0.0, {1: (0, 0, 1, 0, 1)}, {}, {}, {})
+    run.record_metrics(metrics(1, scores=None))
+    run.finish(metrics(1, scores=None), floor_baseline=None, phi_sha256="0", wall_time_s=1.0, exit_reason="stopped")
+    run.close()
+    (row,) = rows(tmp_path / "metrics.csv")
+    assert [key for key, value in row.items() if not value] == [
+        "f_score_visible", "f_score_exposed", "f_score_objects", "precision", "recall",
+        "min_separation_m", "separation_1_m",
+    ]  # fmt: skip
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    empty = [key for key, value in summary.items() if value is None]
+    assert {"f_score_objects", "min_separation_m", "mesh_sha256"} <= set(empty)
+    assert set(summary["floor_baseline"].values()) == {None}
+    assert not (tmp_path / "mesh.ply").exists()
+
+
+def test_the_summary_holds_every_figure_by_which_runs_are_compared(folder: RunFolder) -> None:
+    fly(folder, 0, 10)
+    folder.write_mesh(VERTICES, FACES, COLOURS)
+    summary = finish(folder)
+    baseline = summary.pop("floor_baseline")
+    assert summary.pop("versions") == versions()
+    assert summary == {
+        "mission": "pair", "seed": 7, "drones": 2, "exit_reason": "duration", "J": 0.4321,
+        "f_score_visible": pytest.approx(2 * 0.72 / 1.7), "f_score_exposed": pytest.approx(2 * 0.63 / 1.6),
+        "f_score_objects": pytest.approx(2 * 0.51 / 1.45, abs=1e-6),
+        "precision_visible": 0.9, "precision_exposed": 0.9, "precision_objects": 0.85,
+        "recall_visible": 0.8, "recall_exposed": 0.7, "recall_objects": 0.6,
+        "min_separation_m": 2.91, "jumps": 3, "keyframes": 42, "fallbacks": {"1": 0, "4": 3}, "ticks": 10,
+        "sim_time_s": 0.5, "wall_time_s": 2.5, "phi_sha256": "f" * 64, "mesh_sha256": mesh_sha256(VERTICES, FACES),
+    }  # fmt: skip
+    assert isinstance(baseline, dict)
+    assert baseline["f_score_visible"] == pytest.approx(2 / 3, abs=1e-6)
+
+
+def test_trajectories_and_solver_outcomes_are_read_back(folder: RunFolder) -> None:
+    fly(folder, 0, 10)
+    folder.checkpoint()
+    with np.load(folder.path / "trajectories.npz") as flown:
+        assert flown["drones"].tolist() == [1, 4]
+        assert flown["tick"].tolist() == list(range(10))
+        np.testing.assert_allclose(flown["time_s"], np.arange(10) / 20)
+        assert flown["poses"].shape == (10, 2, 5)
+        np.testing.assert_allclose(flown["poses"][3, 1], [2.97, 0, 2, 0.2, 1.3])
+        assert np.isnan(flown["poses"][7, 1]).all()
+        assert np.isnan(flown["poses"]).sum() == 5
+        np.testing.assert_allclose(flown["solve_time_s"], [[0.001, 0.002]] * 10)
+        np.testing.assert_allclose(flown["slack"], [[0.0, 0.5]] * 10)
+        assert np.argwhere(flown["fallback"] != "").tolist() == [[0, 1], [4, 1], [8, 1]]
+        assert flown["fallback"][4, 1] == "infeasible"
+
+
+def test_a_restarted_process_goes_on_from_the_checkpoint(folder: RunFolder) -> None:
+    fly(folder, 0, 6)
+    folder.record_metrics(metrics(6))
+    folder.checkpoint()
+    folder.close()
+    again = RunFolder(folder.path, MISSION)
+    fly(again, 6, 10)
+    again.record_metrics(metrics(10))
+    summary = finish(again)
+    again.close()
+    assert summary["min_separation_m"] == 2.91
+    assert summary["fallbacks"] == {"1": 0, "4": 3}
+    assert [row["tick"] for row in rows(folder.path / "metrics.csv")] == ["6", "10"]
+    with np.load(folder.path / "trajectories.npz") as flown:
+        assert flown["tick"].tolist() == list(range(10))
+        assert np.isnan(flown["poses"][7, 1]).all()
+
+
+def test_equal_runs_leave_equal_bytes(tmp_path: Path) -> None:
+    written = []
+    for name in ("one", "other"):
+        run = RunFolder(tmp_path / name, MISSION)
+        fly(run, 0, 30)
+        run.record_metrics(metrics(30))
+        run.write_mesh(VERTICES, FACES, COLOURS)
+        finish(run)
+        run.close()
+        written.append({path.name: path.read_bytes() for path in sorted(run.path.iterdir())})
+    assert list(written[0]) == [
+        "mesh.glb", "mesh.ply", "metrics.csv", "mission.json", "summary.json", "trajectories.npz",
+    ]  # fmt: skip
+    assert written[0] == written[1]
+
+
+def test_a_folder_of_another_mission_is_refused(folder: RunFolder) -> None:
+    with pytest.raises(MissionError, match=r"mission\.json: this run folder belongs to another mission"):
+        RunFolder(folder.path, MISSION.model_copy(update={"seed": 8}))
+
+
+def test_the_effective_mission_is_kept(folder: RunFolder) -> None:
+    assert Mission.model_validate_json((folder.path / "mission.json").read_text()) == MISSION
+
+
+def test_the_ply_keeps_positions_faces_and_colours(folder: RunFolder) -> None:
+    folder.write_mesh(VERTICES, FACES, COLOURS)
+    mesh = trimesh.load_mesh(folder.path / "mesh.ply", process=False)
+    np.testing.assert_array_equal(mesh.vertices, VERTICES)
+    np.testing.assert_array_equal(mesh.faces, FACES)
+    np.testing.assert_array_equal(mesh.visual.vertex_colors[:, :3], COLOURS)  # type: ignore[union-attr]
+
+
+def test_the_glb_has_y_up_linear_colours_and_a_matt_material(folder: RunFolder) -> None:
+    folder.write_mesh(VERTICES, FACES, COLOURS)
+    content = (folder.path / "mesh.glb").read_bytes()
+    length = int.from_bytes(content[12:16], "little")
+    tree = json.loads(content[20 : 20 + length])
+    (primitive,) = tree["meshes"][0]["primitives"]
+    assert tree["materials"][primitive["material"]]["pbrMetallicRoughness"]["metallicFactor"] == 0
+    assert "COLOR_0" in primitive["attributes"]
+    (mesh,) = trimesh.load_scene(folder.path / "mesh.glb").geometry.values()
+    np.testing.assert_allclose(mesh.vertices, np.column_stack([VERTICES[:, 0], VERTICES[:, 2], -VERTICES[:, 1]]))
+    np.testing.assert_array_equal(mesh.faces, FACES)
+    # sRGB 128 is 21.6 % of the light (IEC 61966-2-1).
+    assert tree["accessors"][primitive["attributes"]["COLOR_0"]]["max"][:3] == [255, 255, 255]
+    stored = np.frombuffer(content, np.uint8, offset=len(content) - 16).reshape(4, 4)
+    np.testing.assert_array_equal(stored[:, :3], [[255, 0, 0], [0, 255, 0], [0, 0, 255], [55, 55, 55]])
+
+
+def test_an_empty_mesh_leaves_no_file(folder: RunFolder) -> None:
+    folder.write_mesh(VERTICES[:0], FACES[:0], COLOURS[:0])
+    assert not list(folder.path.glob("mesh*"))
+    assert finish(folder)["mesh_sha256"] is None
+
+
+def test_mesh_hashes_depend_on_every_vertex_and_face() -> None:
+    expected = mesh_sha256(VERTICES, FACES)
+    assert mesh_sha256(VERTICES.astype(">f4"), FACES.astype(np.int64)) == expected
+    assert mesh_sha256(VERTICES + np.float32(1e-3), FACES) != expected
+    assert mesh_sha256(VERTICES, FACES[::-1]) != expected
+
+
+def test_versions_name_python_and_what_computes() -> None:
+    found = versions()
+    assert found["python"] == ".".join(map(str, sys.version_info[:3]))
+    assert {"numpy", "numba", "osqp", "coverage-recon"} <= set(found)
+
+
+def test_recording_a_tick_is_cheap(folder: RunFolder) -> None:
+    began = time.process_time()
+    fly(folder, 0, 2000)
+    assert (time.process_time() - began) / 2000 < 0.001  # 200 ticks a second must cost little; measured 0.00002 s
+
+
+def test_rows_survive_a_kill(tmp_path: Path) -> None:
+    script = f"""
+import os, signal
+from pathlib import Path
+from ground_station.results import Metrics, RunFolder
+from protocol.mission import Mission
+run = RunFolder(Path({str(tmp_path / "run")!r}), Mission.model_validate_json({MISSION.model_dump_json()!r}))
+for tick in range(100):
+    run.record_metrics(Metrics(tick / 20, tick, 0.5, None, 0, tick))
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+    root = Path(__file__).parents[2]
+    killed = subprocess.run([sys.executable, "-c", script], cwd=root, check=False, timeout=60)
+    assert killed.returncode == -signal.SIGKILL
+    survived = rows(tmp_path / "run" / "metrics.csv")
+    assert [int(row["keyframes"]) for row in survived] == list(range(100))
+    assert math.isclose(float(survived[-1]["time_s"]), 99 / 20)
