@@ -97,6 +97,9 @@ class Agent:
             self._bus.recheck()
 
     async def _step(self, tick: Tick) -> None:
+        if self._clock.backlog:
+            self._catch_up(tick)
+            return
         telemetry = self._vehicle.telemetry()
         if telemetry is None or not self._is_sound(telemetry, tick):
             log.error("tick %d: no sound telemetry: braking", tick.tick)
@@ -124,6 +127,11 @@ class Agent:
         sent = self._vehicle.send(tick.tick, decision.velocity)
         self._watchdog.feed()
         self._report(tick.tick, decision, sent, solve_s)
+
+    def _catch_up(self, tick: Tick) -> None:
+        """A tick that is over already: phi is integrated with what was heard of it, and nothing is decided."""
+        _, poses = self._log.poses_at(tick.tick, tick.live)
+        self._replica.advance(tick.tick, poses, self._mission.tick_s)
 
     def _is_sound(self, telemetry: Telemetry, tick: Tick) -> bool:
         """Alive, fresh and valid, in simulation too."""
@@ -190,5 +198,6 @@ class Agent:
 async def run_agent(mission: Mission, drone: int, endpoint: str, *, lockstep: bool) -> None:
     """Fly one drone of ``mission`` until it ends."""
     compile_kernels()
+    CoverageController(mission, neighbours=1).rehearse()
     async with connect(endpoint, mission.name, lossless=lockstep) as bus:
         await Agent(mission, drone, bus, lockstep=lockstep).fly()

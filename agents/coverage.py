@@ -44,7 +44,7 @@ class CoverageController:
     """Coverage-Recon's QP-based controller with strict safety rows."""
 
     def __init__(self, mission: Mission, neighbours: int) -> None:
-        """``neighbours``: the most that will ever be known."""
+        """``neighbours``: as many as are expected."""
         self._mission = mission
         self._barriers = Barriers(mission)
         self._program = QuadraticProgram(FIXED_ROWS + neighbours, mission.controller.effort_weight)
@@ -64,17 +64,26 @@ class CoverageController:
         predicted = predicted_pose(pose, velocity, flight)
         rows = self._barriers.rows(predicted, neighbours)
         low, high = self._barriers.velocity_bounds(velocity)
+        if len(rows.names) > self._program.strict_rows:  # somebody who is not in the mission was heard of
+            self._program = QuadraticProgram(len(rows.names), settings.effort_weight)
         solution = self._program.solve(xi1, xi2, rows, low, high)
         if solution.outcome == "solved":
             return Decision(solution.velocity, "solved", solution.slack, sampling, rows, solution.active)
         return Decision(self.brake(rows, low, high), solution.outcome, 0.0, sampling, rows, ())
 
+    def rehearse(self) -> None:
+        """Decide once at no place in particular, so that nothing is left to be compiled in flight."""
+        neighbour = Neighbour(drone=0, position=np.full(3, 1e3), age_s=0.0)
+        self.decide(np.zeros(5), np.zeros(5), [neighbour], SamplingTerms(np.ones(5), 1.0, 1.0), 1.0)
+
     def brake(self, rows: Rows, low: Floats, high: Floats) -> Floats:
-        """Stop; or, when a neighbour is already too near, move away from the worst unless another row forbids it."""
-        worst = int(np.argmin(rows.barriers))
-        if rows.barriers[worst] < 0 and rows.names[worst].startswith("separation"):
-            away = rows.coefficients[worst] / np.linalg.norm(rows.coefficients[worst])
-            retreat = np.clip(away * top_speed(self._mission.flight), low, high)
-            if (rows.coefficients @ retreat >= np.minimum(rows.bounds, 0.0)).all():
-                return retreat
+        """Stop; or, when neighbours are already too near, move away from the nearest unless another row forbids it."""
+        separation = rows.barriers[FIXED_ROWS:]
+        if separation.size and separation.min() < 0:
+            offset = rows.coefficients[FIXED_ROWS + int(separation.argmin())]
+            distance = float(np.linalg.norm(offset))
+            if distance > 0:  # else every direction is as good as any
+                retreat: Floats = np.clip(offset / distance * top_speed(self._mission.flight), low, high)
+                if (rows.coefficients @ retreat >= np.minimum(rows.bounds, 0.0)).all():
+                    return retreat
         return np.zeros(5)

@@ -12,6 +12,8 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
+from protocol.errors import CovreconError
+
 log = logging.getLogger(__name__)
 
 CHECKS_PER_TIMEOUT = 5
@@ -27,6 +29,7 @@ class Watchdog:
     def __init__(self, stop: Callable[[], None], now: Callable[[], float], timeout_s: float) -> None:
         self._stop, self._now, self._timeout_s = stop, now, timeout_s
         self._fed_at: float | None = None
+        self._stopped_at: float | None = None
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
         self.stops = 0
@@ -37,24 +40,34 @@ class Watchdog:
         self._fed_at = self._now()
 
     def check(self) -> bool:
-        """Stop the vehicle if it is overdue; True if so. Silence before the first setpoint is not overdue."""
+        """Stop the vehicle if it is overdue; True if so. Silence before the first setpoint is not overdue.
+
+        Raises:
+            CovreconError: the vehicle could not be told; the next check tries again.
+        """
         fed_at = self._fed_at
-        if fed_at is None or self._now() - fed_at <= self._timeout_s:
+        if fed_at is None or fed_at == self._stopped_at or self._now() - fed_at <= self._timeout_s:
             return False
-        self._fed_at = None
+        self._stop()
+        # `feed` writes its own field alone: a setpoint sent at this very moment is watched again.
+        self._stopped_at = fed_at
         self.stops += 1
         log.error("no setpoint for %.2f s: vehicle stopped", self._timeout_s)
-        self._stop()
         return True
 
     def _watch(self) -> None:
         while not self._ended.wait(self._timeout_s / CHECKS_PER_TIMEOUT):
-            self.check()
+            try:
+                self.check()
+            except CovreconError:
+                log.exception("the vehicle cannot be stopped; trying again")
 
     def __enter__(self) -> Self:
         self._thread.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self._ended.set()
         self._thread.join()

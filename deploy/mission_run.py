@@ -9,6 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal
 
+from agents.coverage import CoverageController
 from deploy.local import Role, mission_roles, supervise
 from deploy.outcome import describe, read_outcome
 from deploy.progress import Display, follow
@@ -27,6 +28,9 @@ def fly(mission: Mission, display: Display, *, out: Path, speed: Speed, started:
         run = make_run_folder(out, mission, started, endpoint)
         roles = mission_roles(run, endpoint, [drone.id for drone in mission.drones], speed)
         with display:
+            # Compiled once here, not in every process at the same time.
+            compile_kernels()
+            CoverageController(mission, neighbours=1).rehearse()
             display.say(f"{mission.name}: drones {len(mission.drones)}, seed {mission.seed}, run folder {run}")
             result = asyncio.run(_supervise_and_show(roles, run, Path(private), endpoint, mission, display))
     try:

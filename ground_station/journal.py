@@ -1,7 +1,8 @@
 """Write-ahead journal of the jumps: on disk before anybody hears of them (safety rule 5).
 
-The file is a header with the epoch, then records of ``length, crc32, bytes``. A record that was torn by a crash is cut
-off when the journal is opened again: nobody can have heard of it.
+The file is a header with the epoch, then for each jump its length, two checksums and its bytes. A record that a crash
+tore can only be the last; nobody can have heard of it, so it is cut off when the journal is opened again. Any other
+damage would lose jumps that the drones have already taken in, and is an error.
 """
 
 from __future__ import annotations
@@ -10,16 +11,25 @@ import os
 import secrets
 import struct
 import zlib
+from io import FileIO
 from pathlib import Path
-from typing import BinaryIO, Self
+from typing import Self
 
-from protocol.errors import JournalError
+from protocol.errors import JournalError, MessageError
 from protocol.messages import Jump
 from protocol.wire import decode, encode
 
 MAGIC = b"covrecon-journal-1\n"
 _EPOCH = struct.Struct("<Q")
-_RECORD = struct.Struct("<II")
+_HEADER_BYTES = len(MAGIC) + _EPOCH.size
+_CONTENT = struct.Struct("<II")  # length and CRC-32 of an encoded jump ...
+_CHECK = struct.Struct("<I")  # ... and the CRC-32 of these two: without it a wrong length would hide what follows
+_HEAD_BYTES = _CONTENT.size + _CHECK.size
+
+
+def _record(content: bytes) -> bytes:
+    head = _CONTENT.pack(len(content), zlib.crc32(content))
+    return head + _CHECK.pack(zlib.crc32(head)) + content
 
 
 class Journal:
@@ -29,40 +39,88 @@ class Journal:
         """Open or create.
 
         Raises:
-            JournalError: it cannot be written, or is not a journal.
+            JournalError: it cannot be written, is not a journal, or is damaged.
         """
         self._path = path
+        self._jumps: list[bytes] = []
+        self._end = 0
         try:
-            self._file: BinaryIO = path.open("r+b" if path.exists() else "x+b")
-            self.epoch, self._jumps = self._read()
+            self._file = FileIO(path, "r+" if path.exists() else "x+")
         except OSError as error:
             raise JournalError(f"{path}: {error.strerror}") from error
+        try:
+            self.epoch = self._read()
+        except OSError as error:
+            self.close()
+            raise JournalError(f"{path}: {error.strerror}") from error
+        except JournalError:
+            self.close()
+            raise
 
-    def _read(self) -> tuple[int, list[bytes]]:
-        header = self._file.read(len(MAGIC) + _EPOCH.size)
-        if not header:
+    def _read(self) -> int:
+        """Take in all whole records; the epoch."""
+        data = self._file.readall()
+        if not data.startswith(MAGIC[: len(data)]):
+            raise JournalError(f"{self._path}: is not a journal")
+        if len(data) < _HEADER_BYTES:  # new, or torn before it held anything
             epoch = secrets.randbits(62) + 1
             self._write(MAGIC + _EPOCH.pack(epoch))
-            return epoch, []
-        if not header.startswith(MAGIC) or len(header) < len(MAGIC) + _EPOCH.size:
-            raise JournalError(f"{self._path}: is not a journal")
-        jumps = []
-        end = self._file.tell()
-        while len(head := self._file.read(_RECORD.size)) == _RECORD.size:
-            length, checksum = _RECORD.unpack(head)
-            content = self._file.read(length)
-            if len(content) < length or zlib.crc32(content) != checksum:
-                break
-            jumps.append(content)
-            end = self._file.tell()
-        self._file.seek(end)
-        self._file.truncate()
-        return _EPOCH.unpack_from(header, len(MAGIC))[0], jumps
+            self._keep_name()
+            return epoch
+        (epoch,) = _EPOCH.unpack_from(data, len(MAGIC))
+        self._end = _HEADER_BYTES
+        while (content := self._record_at(data, self._end)) is not None:
+            self._require_next(epoch, content)
+            self._jumps.append(content)
+            self._end += _HEAD_BYTES + len(content)
+        self._file.truncate(self._end)
+        return int(epoch)
+
+    def _record_at(self, data: bytes, start: int) -> bytes | None:
+        """Content of the record at ``start``; None where there is none, or a torn one."""
+        rest = memoryview(data)[start:]
+        if len(rest) < _HEAD_BYTES:
+            return None
+        length, checksum = _CONTENT.unpack_from(rest)
+        if _CHECK.unpack_from(rest, _CONTENT.size)[0] != zlib.crc32(rest[: _CONTENT.size]):
+            if any(rest):
+                raise JournalError(f"{self._path}: damaged at byte {start}")
+            return None  # room that a file system made for bytes that never came
+        content = rest[_HEAD_BYTES : _HEAD_BYTES + length]
+        if len(content) == length and zlib.crc32(content) == checksum:
+            return bytes(content)
+        if len(rest) > _HEAD_BYTES + length:
+            raise JournalError(f"{self._path}: damaged at byte {start}, and more follows")
+        return None
+
+    def _require_next(self, epoch: int, content: bytes) -> None:
+        try:
+            jump = decode(Jump, content)
+        except MessageError as error:
+            raise JournalError(f"{self._path}: jump {len(self._jumps)}: {error}") from error
+        if (jump.epoch, jump.sequence) != (epoch, len(self._jumps)):
+            raise JournalError(
+                f"{self._path}: holds jump {jump.sequence} of epoch {jump.epoch}"
+                f" where jump {len(self._jumps)} of {epoch} belongs"
+            )
 
     def _write(self, content: bytes) -> None:
-        self._file.write(content)
-        self._file.flush()
+        """Put ``content`` on disk behind what is known to be there, over whatever a write that failed left behind."""
+        self._file.seek(self._end)
+        self._file.truncate()
+        rest = memoryview(content)
+        while rest:
+            rest = rest[self._file.write(rest) :]
         os.fdatasync(self._file.fileno())
+        self._end += len(content)
+
+    def _keep_name(self) -> None:
+        """Put the folder's entry on disk too: a file without a name is lost."""
+        folder = os.open(self._path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
 
     @property
     def next_sequence(self) -> int:
@@ -80,11 +138,9 @@ class Journal:
                 f" {self.next_sequence} of {self.epoch}"
             )
         encoded = encode(jump)
-        start = self._file.tell()
         try:
-            self._write(_RECORD.pack(len(encoded), zlib.crc32(encoded)) + encoded)
+            self._write(_record(encoded))
         except OSError as error:
-            self._file.seek(start)
             raise JournalError(f"{self._path}: {error.strerror}") from error
         self._jumps.append(encoded)
         return encoded

@@ -11,8 +11,8 @@ from __future__ import annotations
 import asyncio
 import json
 from collections import Counter, deque
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
@@ -60,6 +60,15 @@ def _config(mode: Literal["router", "client"], endpoint: str, namespace: str) ->
     return zenoh.Config.from_json5(json.dumps(settings))
 
 
+@contextmanager
+def _errors_of(what: str) -> Iterator[None]:
+    """zenoh's errors as `BusError`, without the place in its source that it appends."""
+    try:
+        yield
+    except zenoh.ZError as error:
+        raise BusError(f"{what}: {str(error).partition(' at /')[0]}") from error
+
+
 @dataclass(slots=True)
 class _Subscription:
     """One key's queue between zenoh's thread and the loop, and who reads it."""
@@ -82,7 +91,8 @@ class BusStatistics:
 class Bus:
     """One process's session. Make it with `connect`; it belongs to the event loop that opened it.
 
-    ``put`` may be called from any thread, everything else from the loop's.
+    ``put`` may be called from any thread, everything else from the loop's. Once it is closed, all of it raises
+    `BusError`.
     """
 
     def __init__(self, session: zenoh.Session, *, lossless: bool) -> None:
@@ -108,20 +118,18 @@ class Bus:
 
     def put_encoded(self, topic: Topic[Any], payload: bytes, drone: int | str = "") -> None:
         key = topic.of(drone)
-        publisher = self._publishers.get(key)
-        if publisher is None:
-            control = zenoh.CongestionControl.BLOCK if self._lossless else zenoh.CongestionControl.DROP
-            publisher = self._session.declare_publisher(
-                key,
-                congestion_control=control,
-                priority=getattr(zenoh.Priority, topic.priority),
-                express=topic.express,
-            )
-            self._publishers[key] = publisher
-        try:
+        with _errors_of(key):
+            publisher = self._publishers.get(key)
+            if publisher is None:
+                control = zenoh.CongestionControl.BLOCK if self._lossless else zenoh.CongestionControl.DROP
+                publisher = self._session.declare_publisher(
+                    key,
+                    congestion_control=control,
+                    priority=getattr(zenoh.Priority, topic.priority),
+                    express=topic.express,
+                )
+                self._publishers[key] = publisher
             publisher.put(payload)
-        except zenoh.ZError as error:
-            raise BusError(f"{key}: {error}") from error
 
     # --- receiving -----------------------------------------------------------------------------------------------
 
@@ -141,7 +149,8 @@ class Bus:
             subscription.queue.append(sample.payload.to_bytes())
             self._wake()
 
-        subscription.handle = self._session.declare_subscriber(key, arrive, allowed_origin=zenoh.Locality.REMOTE)
+        with _errors_of(key):
+            subscription.handle = self._session.declare_subscriber(key, arrive, allowed_origin=zenoh.Locality.REMOTE)
 
     async def until(self, condition: Callable[[], bool], timeout_s: float) -> bool:
         """Wait until ``condition`` holds, checked after each burst of messages; False when time ran out."""
@@ -192,7 +201,8 @@ class Bus:
 
     def announce(self, role: str) -> None:
         """Declare this process alive; call it after everything it answers to is declared."""
-        self._declared.append(self._session.liveliness().declare_token(alive_key(role)))
+        with _errors_of(alive_key(role)):
+            self._declared.append(self._session.liveliness().declare_token(alive_key(role)))
 
     def watch_lives(self) -> None:
         """Keep `alive` up to date, with those that were there before."""
@@ -203,7 +213,8 @@ class Bus:
             self._lives.append((role, sample.kind == zenoh.SampleKind.PUT))
             self._wake()
 
-        self._declared.append(self._session.liveliness().declare_subscriber(alive_key("**"), change, history=True))
+        with _errors_of(alive_key("**")):
+            self._declared.append(self._session.liveliness().declare_subscriber(alive_key("**"), change, history=True))
 
     # --- queries -------------------------------------------------------------------------------------------------
 
@@ -223,7 +234,8 @@ class Bus:
             except RuntimeError:  # closed: the query's drop tells the asker
                 return
 
-        self._declared.append(self._session.declare_queryable(topic.key, arrive))
+        with _errors_of(topic.key):
+            self._declared.append(self._session.declare_queryable(topic.key, arrive))
 
     async def ask(self, topic: Topic[M], parameters: str) -> M:
         """The first valid answer to a query.
@@ -248,22 +260,19 @@ class Bus:
             post(_settle, done, None)
 
         callback = zenoh.handlers.Callback(arrive, finish, indirect=False)
-        self._session.get(f"{topic.key}?{parameters}", callback, timeout=QUERY_TIMEOUT_S)
+        with _errors_of(topic.key):
+            self._session.get(f"{topic.key}?{parameters}", callback, timeout=QUERY_TIMEOUT_S)
         await done
         for payload in replies:
             try:
                 return decode(topic.message, payload)
             except MessageError:
                 self.statistics.refused[topic.key] += 1
-        raise NoReply(f"{topic.key}?{parameters}: no valid answer within {QUERY_TIMEOUT_S:g} s")
+        raise NoReply(f"{topic.key}?{parameters}: no valid answer")
 
     def close(self) -> None:
         self._closed = True
         self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub leaves it untyped
-
-
-def _open(mode: Literal["router", "client"], endpoint: str, namespace: str) -> zenoh.Session:
-    return zenoh.open(_config(mode, endpoint, namespace))
 
 
 @asynccontextmanager
@@ -283,17 +292,19 @@ async def connect(
     Raises:
         BusError: the endpoint is malformed, taken, or nobody listened in time.
     """
-    namespace = f"covrecon/{mission}"
     loop = asyncio.get_running_loop()
     deadline = loop.time() + timeout_s
-    mode: Literal["router", "client"] = "router" if router else "client"
+    what = f"cannot {'listen at' if router else 'reach'} {endpoint or 'an empty endpoint'}"
+    with _errors_of(what):
+        config = _config("router" if router else "client", endpoint, f"covrecon/{mission}")
     while True:
         try:
-            session = await asyncio.to_thread(_open, mode, endpoint, namespace)
+            with _errors_of(what):
+                session = await asyncio.to_thread(zenoh.open, config)
             break
-        except zenoh.ZError as error:
+        except BusError:
             if router or loop.time() > deadline:
-                raise BusError(f"cannot {'listen at' if router else 'reach'} {endpoint}: {error}") from error
+                raise
             await asyncio.sleep(CONNECT_RETRY_S)
     bus = Bus(session, lossless=lossless)
     try:

@@ -16,6 +16,11 @@ class Clock(Protocol):
         """The next tick in order; None when none came in ``timeout_s`` of wall time."""
         ...
 
+    @property
+    def backlog(self) -> int:
+        """Ticks that came since the one returned last: this process is late by so many."""
+        ...
+
     def now_s(self) -> float:
         """Monotonic seconds by which silence is judged; callable from any thread."""
         ...
@@ -42,6 +47,10 @@ class SimulatorClock:
         if await self._bus.until(lambda: bool(self._ticks), timeout_s):
             return self._ticks.popleft()
         return None
+
+    @property
+    def backlog(self) -> int:
+        return len(self._ticks)
 
     def now_s(self) -> float:
         return self._time_s if self._lockstep else time.monotonic()

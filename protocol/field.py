@@ -19,7 +19,7 @@ def _cell_centres(low: float, high: float, wished: float) -> Floats:
     """Centres of the equal cells whose edge is nearest to ``wished`` (PAPER.md, error 4: both sizes come out)."""
     count = max(1, round((high - low) / wished))
     edge = (high - low) / count
-    return low + edge * (np.arange(count) + 0.5)
+    return low + edge * (np.arange(count, dtype=np.float64) + 0.5)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""When a camera has moved enough for another keyframe; the same rule in cameras (to save bandwidth) and on the ground."""
+"""When a camera has moved enough for another keyframe: the rule by which cameras save bandwidth."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class KeyframeRule:
         self._last: tuple[Floats, Floats] | None = None
 
     def wants(self, position: Floats, rotation: Floats) -> bool:
-        """Whether a frame at ``position`` (3,), camera-to-world ``rotation`` (3, 3), is a keyframe; if so, remember it."""
+        """Whether a frame at ``position`` (3,), camera-to-world ``rotation`` (3, 3), is a keyframe; if so, remember."""
         if self._last is not None:
             moved = math.dist(position, self._last[0])
             turned_cosine = (float(np.sum(rotation * self._last[1])) - 1) / 2  # trace of R^T R' = 1 + 2 cos

@@ -145,8 +145,9 @@ class Feedback(Settings):
     """Vertex-count change that counts, eq. (5)."""
     kernel_m: Positive = 0.4
     """sigma_4."""
-    spacing_m: Positive = 0.3
-    """Spacing of the evaluation points r_k; not stated in the paper (PAPER.md, error 6)."""
+    spacing_m: Positive = 0.1
+    """Spacing of the evaluation points r_k; not stated in the paper (PAPER.md, error 6). At 0.3 m every point holds
+    some vertex that moved, and J hangs at its threshold; at 0.1 m jumps shrink as the map settles (docs/adr/0003)."""
     normalisation: Literal["sum", "mean"] = "mean"
     """"sum" as printed; "mean" divides by the kernel's weight, so that one jump never exceeds the gain."""
 

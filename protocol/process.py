@@ -12,6 +12,8 @@ from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from pathlib import Path
 
+import uvloop
+
 from protocol.errors import BusError, CovreconError, MissionError, SceneError
 from protocol.guard import require_own_packages
 from protocol.mission import Mission
@@ -56,15 +58,14 @@ def parse(role: str, arguments: list[str] | None = None) -> Arguments:
 
 
 def run_process(role: str, body: Callable[[Arguments], Coroutine[None, None, None]]) -> int:
-    """Run one process's ``body`` to its end or to SIGTERM; its exit code. Errors go to stderr, the last line says what."""
+    """Run one process's ``body`` to its end or to SIGTERM; its exit code. Stderr's last line says what failed."""
     faulthandler.enable()
-    logging.basicConfig(
-        level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(name)s: %(message)s"
-    )
+    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     try:
         require_own_packages()
         arguments = parse(role)
-        return asyncio.run(_until_signal(body(arguments)))
+        # An eighth less CPU a tick than asyncio's own loop, in lockstep where a tick is nothing but messages.
+        return uvloop.run(_until_signal(body(arguments)))
     except (MissionError, SceneError, BusError) as error:
         print(error, file=sys.stderr)
         return BAD_INPUT

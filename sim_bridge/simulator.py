@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 START_PATIENCE_S = 120.0
 """For all processes to import, compile and connect on a slow machine."""
-LOCKSTEP_PATIENCE_S = 10.0
+LOCKSTEP_PATIENCE_S = 30.0
 """An agent that has not answered for so long is flown around: its vehicle brakes, the others go on."""
 GROUND_PATIENCE_S = 120.0
 """The ground station may be busy reconstructing; only its death or this ends the run."""
@@ -156,6 +156,8 @@ class Simulator:
             late = {drone for drone in self._live() if self._answered[drone] < tick}
             log.error("tick %d: no answer from drones %s: going on without them", tick, sorted(late))
             self._silent |= late
+        if not self._live():
+            raise ProcessError(f"tick {tick}: no drone answers")
 
     async def _wait_for_ground(self, tick: int) -> None:
         for _ in range(int(GROUND_PATIENCE_S / CHECK_S)):

@@ -35,12 +35,18 @@ def _advance(
     """One pixel along a path: fills ``path`` (D + 2, with borders) from ``previous``, whose minimum is ``lowest``."""
     step = np.float32(STEP_PENALTY)
     ceiling = lowest + jump
-    smallest = np.float32(BORDER)
     for plane in range(cost.size):
         beside = min(previous[plane], previous[plane + 2]) + step
-        best = min(min(previous[plane + 1], beside), ceiling)
-        value = np.float32(np.int32(cost[plane])) + best - lowest
-        path[plane + 1] = value
+        best = min(previous[plane + 1], beside, ceiling)
+        path[plane + 1] = np.float32(np.int32(cost[plane])) + best - lowest
+    return _smallest(path)
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _smallest(values: NDArray[np.float32]) -> np.float32:
+    smallest: np.float32 = values[0]
+    for place in range(values.size):
+        value = values[place]
         smallest = min(smallest, value)
     return smallest
 
@@ -65,11 +71,11 @@ def _add_paths(total: NDArray[np.float32], along_row: NDArray[np.float32], along
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _winner(total: NDArray[np.float32]) -> int:
-    best = 0
-    for plane in range(1, total.size):
-        if total[plane] < total[best]:
-            best = plane
-    return best
+    smallest = _smallest(total)
+    plane = 0
+    while total[plane] > smallest:
+        plane += 1
+    return plane
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")

@@ -26,7 +26,7 @@ OVERLAP_MIN: Final = 0.5
 SAMPLES: Final = ((0.5, 0.5), (0.2, 0.2), (0.8, 0.2), (0.2, 0.8), (0.8, 0.8))
 """Where in the image the sample points lie, as shares of its width and height; the first rates the angle."""
 SAME_SIDE_DISCOUNT: Final = 0.5
-"""Taken off a view's rating when one in the same direction is chosen: what hides a point from one hides it from both."""
+"""Taken off a rating when a view in the same direction is chosen: what hides a point from one, hides it from both."""
 RATING_MIN: Final = 0.02
 
 

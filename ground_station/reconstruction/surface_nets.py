@@ -29,7 +29,7 @@ def extract_mesh(volume: Volume, weight_min: float) -> Mesh:
     crossings = np.zeros(shape, np.uint8)
     _classify(volume.distance.ravel(), volume.weight.ravel(), np.float32(weight_min), sides.ravel())
     _find_crossed_cells(sides, crossings)
-    vertex_count, face_bound = _count(sides, crossings)
+    vertex_count, face_bound = _count(crossings)
     vertices = np.empty((vertex_count, 3), np.float32)
     colors = np.empty((vertex_count, 3), np.uint8)
     faces = np.empty((face_bound, 3), np.int32)
@@ -57,7 +57,7 @@ def _merge(first: NDArray[np.uint8], second: NDArray[np.uint8], merged: NDArray[
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _find_crossed_cells(sides: NDArray[np.uint8], crossings: NDArray[np.uint8]) -> None:
-    """``crossings`` of a cell: its eight corners' sides united; the surface crosses it where they are front and back."""
+    """``crossings`` of a cell: its eight corners' sides united; it is crossed where they are front and back."""
     size_i, size_j, size_k = sides.shape
     near, far = np.empty(size_k - 1, np.uint8), np.empty(size_k - 1, np.uint8)
     for i in range(size_i - 1):
@@ -70,7 +70,7 @@ def _find_crossed_cells(sides: NDArray[np.uint8], crossings: NDArray[np.uint8]) 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _count(sides: NDArray[np.uint8], crossings: NDArray[np.uint8]) -> tuple[int, int]:
+def _count(crossings: NDArray[np.uint8]) -> tuple[int, int]:
     """Number of vertices, and an upper bound of the number of triangles."""
     vertices = 0
     for i in range(crossings.shape[0]):

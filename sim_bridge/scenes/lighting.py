@@ -29,8 +29,12 @@ BOUNCE_COLOUR = (0.42, 0.39, 0.36)
 """What surfaces send back, once they are far from the lit point ..."""
 BOUNCE_REACH_M = 0.5
 """... which they darken where they are closer than about this."""
-OFFSET_M = 2e-3
-"""Rays start so far above the surface, and so far inside its border: in the corner of a room, not within its walls."""
+LIFT_M = 2e-3
+"""Rays start so far above the surface ..."""
+INSET_M = 0.016
+"""... so far inside its border, or they would start within the next wall ..."""
+CONTACT_M = 0.015
+"""... and so far along the ray: the dark under a plate would bleed out over a whole triangle."""
 
 LONGEST_EDGE_M = 1.0
 SHORTEST_EDGE_M = 0.1
@@ -158,7 +162,7 @@ def _gather(caster: Any, sky: _Sky, points: Floats, normals: Floats) -> Floats:
         cosine = normals @ direction
         seen = np.flatnonzero(cosine > 0)
         rays = np.empty((len(seen), 6), dtype=np.float32)
-        rays[:, :3] = origins[seen]
+        rays[:, :3] = origins[seen] + (CONTACT_M * direction).astype(np.float32)
         rays[:, 3:] = direction
         distance = caster.cast_rays(rays)["t_hit"].numpy()
         reach = 1.0 - np.exp(-distance / BOUNCE_REACH_M)
@@ -182,9 +186,10 @@ def _lit_places(surfaces: Surfaces) -> tuple[Floats, Floats, NDArray[np.int64]]:
     inwards = (triangles.mean(axis=1, keepdims=True) - triangles).reshape(-1, 3)
     inset = np.zeros((len(first), 3))
     np.add.at(inset, corners, inwards)
-    inset -= np.einsum("ij,ij->i", inset, normals[first])[:, None] * normals[first]  # a bulging surface hides nothing
-    inset /= np.maximum(np.linalg.norm(inset, axis=1, keepdims=True), OFFSET_M)
-    points = triangles.reshape(-1, 3)[first] + OFFSET_M * (normals[first] + inset)
+    inset /= np.bincount(corners)[:, None]
+    inset -= np.einsum("ij,ij->i", inset, normals[first])[:, None] * normals[first]  # along the surface
+    inset *= np.minimum(0.5, INSET_M / np.maximum(np.linalg.norm(inset, axis=1, keepdims=True), 1e-9))
+    points = triangles.reshape(-1, 3)[first] + LIFT_M * normals[first] + inset
     return points, normals[first], corners.reshape(-1, 3)
 
 

@@ -125,7 +125,7 @@ def _cached(
 
 
 def _read(path: Path) -> Scene:
-    with np.load(path, allow_pickle=False) as data:
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
         return Scene(
             triangles=data["triangles"],
             uv=data["uv"],

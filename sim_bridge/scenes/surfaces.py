@@ -48,7 +48,6 @@ class Material:
     tile_m: float = 1.0
     """Length of one repeat of the texture."""
     two_sided: bool = False
-    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
 def join(parts: Sequence[Surfaces]) -> Surfaces:
@@ -66,7 +65,7 @@ def surface(triangles: Floats, uv: Floats, material: Material) -> Surfaces:
     return Surfaces(
         np.asarray(triangles, dtype=np.float64),
         np.asarray(uv, dtype=np.float64),
-        np.broadcast_to(np.array(material.tint), (count, 3, 3)).copy(),
+        np.ones((count, 3, 3)),
         np.full(count, material.texture, dtype=np.int32),
         np.full(count, material.two_sided),
     )

@@ -29,11 +29,6 @@ class TextureSet:
     sizes: NDArray[np.int32]
     """[K, 3]: width, height and number of levels; level l is ``max(1, width >> l) x max(1, height >> l)``."""
 
-    def average(self, texture: int) -> NDArray[np.float64]:
-        """Mean colour, (3,), 0..255: the pyramid's last level."""
-        packed = int(self.texels[self.offsets[texture, self.sizes[texture, 2] - 1]])
-        return np.array([packed & 255, packed >> 8 & 255, packed >> 16 & 255], dtype=np.float64)
-
 
 def build_texture_set(images: Sequence[NDArray[np.uint8]]) -> TextureSet:
     """Pack images [H, W, 3] (any size) with their mip levels (box filter)."""

@@ -126,7 +126,7 @@ def _key(scene: Scene, mission: Mission) -> str:
 
 def _read(path: Path) -> Truth | None:
     try:
-        with np.load(path, allow_pickle=False) as data:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
             return Truth(data["points"], data["exposed"], data["visible"])
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         log.warning("%s is damaged (%s): sampling the truth again", path, error)

@@ -28,7 +28,7 @@ STEEPEST_INCIDENCE_RAD = math.radians(83)
 OPEN_M = 0.04
 """A place in the open keeps this distance from all surfaces, and is reached from above through such places."""
 OPEN_GRID_M = 0.06
-DIRECTIONS = 128
+DIRECTIONS = 96
 """Tried for each point: over the sphere for exposed, over the directions that a camera allows for visible."""
 OFFSET_M = 1e-3
 """Rays start so far in front of the surface."""
@@ -98,35 +98,38 @@ def _seen(
     exact = scene.triangles.astype(np.float64)
     normals = np.cross(exact[:, 1] - exact[:, 0], exact[:, 2] - exact[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    own, both_sides = normals[faces], scene.two_sided[faces]
+    own, both_sides = normals[faces].astype(np.float32), scene.two_sided[faces]
     seen = np.zeros(len(points), dtype=np.bool_)
+    unseen = np.arange(len(points))
     # Shuffled, so that the first few directions already look everywhere.
-    for direction in np.random.default_rng(0).permutation(directions):
-        cosine = own @ direction
-        facing = np.where(both_sides, np.abs(cosine), cosine) > math.cos(steepest_rad)
-        tried = np.flatnonzero(facing & ~seen)
-        starts = points[tried] + OFFSET_M * np.sign(cosine[tried])[:, None] * own[tried]
-        rays = np.concatenate([starts, np.broadcast_to(direction, starts.shape)], axis=1).astype(np.float32)
+    for direction in np.random.default_rng(0).permutation(directions).astype(np.float32):
+        cosine = own[unseen] @ direction
+        facing = np.where(both_sides[unseen], np.abs(cosine), cosine) > math.cos(steepest_rad)
+        tried, side = unseen[facing], np.sign(cosine[facing])
+        rays = np.empty((len(tried), 6), dtype=np.float32)
+        rays[:, :3] = points[tried] + (np.float32(OFFSET_M) * side)[:, None] * own[tried]
+        rays[:, 3:] = direction
         length = caster.cast_rays(rays)["t_hit"].numpy()
-        seen[tried] = _passes_free_place(starts, direction, length, places.free, places.origin, places.spacing)
+        seen[tried] = _passes_free_place(rays, length, places.free, places.origin, places.spacing)
+        unseen = unseen[~seen[unseen]]
     return seen
 
 
 @njit(cache=True, nogil=True)
 def _passes_free_place(
-    starts: Floats,
-    direction: Floats,
+    rays: NDArray[np.float32],
     lengths: NDArray[np.float32],
     free: NDArray[np.bool_],
     origin: Floats,
     spacing: float,
 ) -> NDArray[np.bool_]:
-    """Whether each ray passes a free place of the grid before it ends, [n]; tried at steps of the grid's spacing."""
-    passes = np.zeros(len(starts), dtype=np.bool_)
-    for ray in range(len(starts)):
+    """Whether each ray [n, 6] passes a free place of the grid before it ends, tried at steps of the grid's spacing."""
+    passes = np.zeros(len(rays), dtype=np.bool_)
+    for ray in range(len(rays)):
+        start, direction = rays[ray, :3], rays[ray, 3:]
         begin, end = 0.0, float(lengths[ray])
         for axis in range(3):
-            low = origin[axis] - starts[ray, axis]
+            low = origin[axis] - start[axis]
             high = low + (free.shape[axis] - 1) * spacing
             if abs(direction[axis]) < 1e-9:
                 if low > 0.0 or high < 0.0:
@@ -136,9 +139,9 @@ def _passes_free_place(
             begin, end = max(begin, min(one, other)), min(end, max(one, other))
         along = begin
         while along <= end:
-            x = round((starts[ray, 0] + along * direction[0] - origin[0]) / spacing)
-            y = round((starts[ray, 1] + along * direction[1] - origin[1]) / spacing)
-            z = round((starts[ray, 2] + along * direction[2] - origin[2]) / spacing)
+            x = round((start[0] + along * direction[0] - origin[0]) / spacing)
+            y = round((start[1] + along * direction[1] - origin[1]) / spacing)
+            z = round((start[2] + along * direction[2] - origin[2]) / spacing)
             if free[x, y, z]:
                 passes[ray] = True
                 break

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from numba import njit
 
 from agents.barriers import Neighbour, predicted_pose
 from agents.coverage import CoverageController
@@ -169,3 +170,35 @@ def test_every_replica_integrates_the_same_field() -> None:
     for _ in range(100):
         flight.step()
     assert len({replica.sha256 for replica in flight.replicas}) == 1
+
+
+@njit(cache=True)
+def dense_decay(phi, positions, directions, pose, sigmas, distance, rate) -> None:
+    """Eqs. (1) and (2) for one drone over every cell in float64; past e^-45 a factor is 1 to the last bit."""
+    axis = (np.cos(pose[3]) * np.cos(pose[4]), np.sin(pose[3]) * np.cos(pose[4]), -np.sin(pose[4]))
+    for i in range(positions.shape[0]):
+        d = positions[i] - pose[:3]
+        r = np.sqrt((d * d).sum())
+        c1 = (axis[0] * d[0] + axis[1] * d[1] + axis[2] * d[2]) / r
+        position = (1 - c1) ** 2 / (2 * sigmas[0] ** 2) + (r - distance) ** 2 / (2 * sigmas[2] ** 2)
+        if position > 45:
+            continue
+        for j in range(directions.shape[0]):
+            c2 = -(directions[j, 0] * d[0] + directions[j, 1] * d[1] + directions[j, 2] * d[2]) / r
+            exponent = position + (1 - c2) ** 2 / (2 * sigmas[1] ** 2)
+            if exponent < 45:
+                phi[i, j] *= np.exp(-rate * np.exp(-exponent))
+
+
+def test_importance_over_600_s_equals_the_dense_formula() -> None:
+    flight = TeamFlight(Mission(drones=(Drone(id=1, start=(0.0, 1.0, 2.0, 0.0, 1.3)),)))
+    field, sensing = flight.replicas[0].field, flight.mission.sensing
+    phi, positions = np.ones(field.shape), field.positions()
+    sigmas = (sensing.sigma_axis, sensing.sigma_view, sensing.sigma_distance_m)
+    for tick in range(12_000):
+        pose = flight.bodies[0].pose.copy()
+        flight.step()
+        dense_decay(phi, positions, field.directions, pose, sigmas, sensing.distance_m, sensing.decay_per_s * 0.05)
+        if tick % 20 == 0:
+            assert flight.importance == pytest.approx(phi.mean(), abs=1e-4)
+    assert flight.importance < 0.05

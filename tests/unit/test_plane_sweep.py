@@ -86,7 +86,7 @@ def test_depths_guessed_because_the_true_one_is_beyond_the_planes_are_not_confir
     near = DepthRange(nearest=0.4, farthest=1.0, typical=0.8)
     first = estimator.estimate(views[0], views[1:], near)
     second = estimator.estimate(views[1], [views[0], *views[2:]], near)
-    assert np.mean(agreements(views[0], first.depth, [(views[1], second.depth)])) < 0.1
+    assert np.mean(agreements(views[0], first.depth, [(views[1], second.depth)])) < 0.15
 
 
 def test_no_depth_is_believed_where_the_image_shows_nothing(estimator: DepthEstimator) -> None:

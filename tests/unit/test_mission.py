@@ -1,0 +1,143 @@
+"""What the mission model refuses, setting by setting and across settings."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Iterator
+from typing import Any, TypeAlias
+
+import pytest
+from pydantic import ValidationError
+
+from protocol.mission import Box, Camera, Feedback, Mission
+
+Place: TypeAlias = tuple[str | int, ...]
+
+TWO: dict[str, Any] = {
+    "drones": [{"id": 1, "start": (0, 1, 2, 0, 1.3)}, {"id": 2, "start": (1.5, 1, 2, 0, 1.3)}],
+}
+
+
+def changed(place: Place, value: object) -> dict[str, Any]:
+    """The whole effective mission of two drones with one setting exchanged."""
+    settings = copy.deepcopy(Mission.model_validate(TWO).model_dump())
+    inner: Any = settings
+    for key in place[:-1]:
+        if isinstance(inner[key], tuple):
+            inner[key] = list(inner[key])
+        inner = inner[key]
+    inner[place[-1]] = value
+    return settings
+
+
+def numbers(tree: object, here: Place = ()) -> Iterator[Place]:
+    if isinstance(tree, float):
+        yield here
+    inner = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list | tuple) else ()
+    for key, value in inner:
+        yield from numbers(value, (*here, key))
+
+
+def faults(settings: object) -> str:
+    with pytest.raises(ValidationError) as caught:
+        Mission.model_validate(settings)
+    return "\n".join(".".join(map(str, fault["loc"])) + ": " + fault["msg"] for fault in caught.value.errors())
+
+
+@pytest.mark.parametrize(
+    "place", list(numbers(Mission.model_validate(TWO).model_dump())), ids=lambda place: ".".join(map(str, place))
+)
+def test_no_number_may_be_infinite_or_not_a_number(place: Place) -> None:
+    for bad in (math.nan, math.inf, -math.inf):
+        assert ".".join(map(str, place)) in faults(changed(place, bad))
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_box_has_volume_on_every_axis(axis: int) -> None:
+    upper = [1.0, 1.0, 1.0]
+    upper[axis] = 0.0
+    with pytest.raises(ValidationError, match="must exceed lower_m"):
+        Box(lower_m=(0, 0, 0), upper_m=(upper[0], upper[1], upper[2]))
+
+
+def test_a_box_contains_its_faces_and_nothing_beyond() -> None:
+    box = Box(lower_m=(0, 0, 0), upper_m=(1, 2, 3))
+
+    assert box.contains((0, 0, 0))
+    assert box.contains((1, 2, 3))
+    assert not box.contains((1.001, 1, 1))
+    assert not box.contains((0.5, 1, -0.001))
+
+
+@pytest.mark.parametrize("key", ["yaw_rad", "pitch_rad"])
+@pytest.mark.parametrize("angles", [(1.0, 1.0), (1.2, 0.2)])
+def test_the_target_s_angles_ascend(key: str, angles: tuple[float, float]) -> None:
+    assert f"{key} must be [smaller, larger]" in faults(changed(("target", key), angles))
+
+
+@pytest.mark.parametrize("limits", [(1.2, 1.2), (1.5, 1.0), (-1.6, 1.0), (0.0, 1.6)])
+def test_the_gimbal_s_limits_ascend_within_a_quarter_turn(limits: tuple[float, float]) -> None:
+    assert "pitch_limits_rad must ascend within" in faults(changed(("flight", "pitch_limits_rad"), limits))
+
+
+def test_a_jump_takes_effect_before_the_next_mesh_is_compared() -> None:
+    assert Feedback(delay_s=2.0, period_s=2.0).delay_s == 2.0
+    with pytest.raises(ValidationError, match=r"delay_s 2\.5 must not exceed period_s 2"):
+        Feedback(delay_s=2.5, period_s=2.0)
+
+
+def test_an_angle_between_keyframes_is_at_most_half_a_turn() -> None:
+    assert Camera(keyframe_angle_rad=math.pi).keyframe_angle_rad == math.pi
+    with pytest.raises(ValidationError, match="keyframe_angle_rad"):
+        Camera(keyframe_angle_rad=math.pi + 1e-6)
+
+
+def test_ids_of_drones_differ() -> None:
+    assert "ids must differ, got [1, 1]" in faults(changed(("drones", 1, "id"), 1))
+
+
+def test_drones_start_apart() -> None:
+    assert Mission.model_validate(changed(("drones", 1, "start"), (1.0, 1, 2, 0, 1.3)))
+    assert "0.90 m from drone 1, less than flight.separation_m 1" in faults(
+        changed(("drones", 1, "start"), (0.9, 1, 2, 0, 1.3))
+    )
+
+
+@pytest.mark.parametrize("start", [(-4.1, 1, 2, 0, 1.3), (0, 4.1, 2, 0, 1.3), (0, 1, 0.4, 0, 1.3)])
+def test_drones_start_inside_the_flight_region(start: tuple[float, ...]) -> None:
+    assert "lies outside the flight region" in faults(changed(("drones", 0, "start"), start))
+
+
+@pytest.mark.parametrize("pitch", [1.0, 1.6])
+def test_drones_start_with_a_pitch_that_the_gimbal_has(pitch: float) -> None:
+    assert f"pitch {pitch:g} lies outside flight.pitch_limits_rad" in faults(
+        changed(("drones", 0, "start"), (0, 1, 2, 0, pitch))
+    )
+
+
+def test_the_nearest_depth_lies_before_the_farthest() -> None:
+    assert "nearest_m: must be less than farthest_m" in faults(changed(("reconstruction", "nearest_m"), 4.2))
+
+
+def test_all_faults_of_a_team_are_told_at_once() -> None:
+    settings = changed(("drones", 1), {"id": 1, "start": (0, 1.5, 9, 0, 0.3)})
+
+    told = faults(settings)
+
+    assert all(words in told for words in ("ids must differ", "outside the flight region", "pitch 0.3 lies outside"))
+
+
+def test_a_mission_needs_a_drone() -> None:
+    assert "drones: " in faults({"drones": []})
+
+
+def test_a_tick_is_the_inverse_of_the_rate() -> None:
+    assert Mission.model_validate(TWO | {"controller": {"rate_hz": 50}}).tick_s == 0.02
+    assert Mission.model_validate(TWO).tick_s == 0.05
+
+
+def test_settings_never_change_after_loading() -> None:
+    mission = Mission.model_validate(TWO)
+    with pytest.raises(ValidationError, match="frozen"):
+        mission.flight.separation_m = 0.1

@@ -1,0 +1,87 @@
+"""Whoever is in the mission, or was ever heard of, stays an obstacle."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from agents.team import Team
+from protocol.messages import DroneState
+from protocol.mission import Flight
+
+FLIGHT = Flight(response_time_s=0.2)
+TICK_S = 0.05
+STARTS = {drone: np.array([float(drone), 0.0, 2.0, 0.0, 1.3]) for drone in (1, 2, 5)}
+
+
+def team() -> Team:
+    """Of drone 2."""
+    return Team(2, STARTS, FLIGHT, TICK_S)
+
+
+def state(drone: int, tick: int, x: float, speed: float = 0.0) -> DroneState:
+    return DroneState(
+        drone=drone,
+        tick=tick,
+        pose=(x, 1.0, 2.0, 0.0, 1.3),
+        velocity=(speed, 0.0, 0.0, 0.0, 0.0),
+        battery=1.0,
+        mode="flying",
+        importance=1.0,
+        control=None,
+    )
+
+
+def test_a_drone_that_never_spoke_is_an_obstacle_at_its_start_that_grows() -> None:
+    neighbours = team().neighbours(20)
+
+    assert [neighbour.drone for neighbour in neighbours] == [1, 5]
+    assert [neighbour.position.tolist() for neighbour in neighbours] == [[1, 0, 2], [5, 0, 2]]
+    assert [neighbour.age_s for neighbour in neighbours] == pytest.approx([1.0, 1.0])
+
+
+def test_a_drone_is_no_obstacle_to_itself() -> None:
+    own = team()
+    own.hear(state(2, 3, 9.0))
+
+    assert [neighbour.drone for neighbour in own.neighbours(3)] == [1, 5]
+
+
+def test_a_neighbour_is_where_it_will_come_to_rest() -> None:
+    known = team()
+    known.hear(state(1, 8, x=3.0, speed=0.5))
+
+    first = known.neighbours(8)[0]
+
+    assert first.position == pytest.approx(np.array([3.1, 1.0, 2.0]))
+    assert first.age_s == 0.0
+
+
+def test_a_silent_neighbour_ages_by_the_ticks_since_its_last_state() -> None:
+    known = team()
+    known.hear(state(5, 8, x=3.0))
+
+    assert [neighbour.age_s for neighbour in known.neighbours(28)] == pytest.approx([1.4, 1.0])
+
+
+def test_an_older_state_never_replaces_a_newer_one() -> None:
+    known = team()
+    known.hear(state(1, 8, x=3.0))
+    known.hear(state(1, 7, x=-3.0))
+
+    assert known.neighbours(9)[0].position[0] == 3.0
+    assert known.neighbours(9)[0].age_s == pytest.approx(TICK_S)
+
+
+def test_a_state_ahead_of_the_tick_at_hand_has_no_age() -> None:
+    known = team()
+    known.hear(state(1, 12, x=3.0))
+
+    assert known.neighbours(10)[0].age_s == 0.0
+
+
+def test_a_stranger_that_is_heard_of_becomes_an_obstacle_and_stays_one() -> None:
+    known = team()
+    known.hear(state(3, 8, x=3.0))
+
+    assert [neighbour.drone for neighbour in known.neighbours(100)] == [1, 3, 5]

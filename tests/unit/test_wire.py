@@ -1,0 +1,379 @@
+"""What crosses a process boundary comes out as it went in, or not at all."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Iterator
+from typing import Any, TypeAlias
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from protocol import messages
+from protocol.errors import MessageError, VersionError
+from protocol.messages import (
+    Control,
+    DroneState,
+    DroneStatus,
+    JournalPage,
+    Jump,
+    JumpHead,
+    Keyframe,
+    MissionPhase,
+    Setpoint,
+    Status,
+    Tick,
+    VehicleSample,
+)
+from protocol.wire import MAX_MESSAGE_BYTES, WIRE_VERSION, Message, decode, encode
+
+Place: TypeAlias = tuple[str | int, ...]
+
+SAMPLE = VehicleSample(drone=2, pose=(0.0, 1.5, 2.0, -0.3, 1.3), velocity=(0.1, -0.5, 0.0, 0.2, -0.1), battery=0.5)
+CONTROL = Control(
+    tick=41,
+    outcome="infeasible",
+    velocity=(0.0, 0.25, 0.0, 0.0, 0.0),
+    slack=-3.5,
+    sampling=812.25,
+    solve_s=1e-4,
+    separation_margin_m2=0.75,
+    region_margin_m=1.5,
+    pitch_margin_rad2=0.0625,
+    active=("region:+x", "separation:3"),
+    fallbacks=1,
+    refused=2,
+)
+ROW = DroneStatus(
+    drone=1,
+    alive=True,
+    mode="flying",
+    position=(0.5, 1.5, 2.5),
+    speed_mps=0.5,
+    separation_m=1.25,
+    slack=-0.5,
+    solve_s=1e-4,
+    fallbacks=0,
+)
+EXAMPLES: tuple[Message, ...] = (
+    SAMPLE,
+    Tick(
+        tick=3,
+        time_s=0.15,
+        lockstep=True,
+        live=(1, 2),
+        vehicles=(SAMPLE, SAMPLE.model_copy(update={"drone": 7})),
+        jump_epoch=2**62,
+        next_jump=4,
+        keyframes=5,
+    ),
+    Setpoint(drone=255, tick=12, velocity=(0.5, -0.5, 0.0, 0.5, -0.5)),
+    CONTROL,
+    DroneState(
+        drone=3,
+        tick=42,
+        pose=(1.5, 2.5, 3.5, 0.5, 1.25),
+        velocity=(0.0, 0.0, 0.5, 0.0, 0.0),
+        battery=1.0,
+        mode="braking",
+        importance=0.75,
+        control=CONTROL,
+    ),
+    Keyframe(
+        drone=1,
+        sequence=9,
+        tick=100,
+        position=(1.0, 2.0, 3.0),
+        rotation=((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)),
+        width=320,
+        height=180,
+        fx=213.5,
+        fy=213.5,
+        cx=160.0,
+        cy=90.0,
+        jpeg=b"\xff\xd8\x00\xff\xd9",
+    ),
+    Jump(epoch=5, sequence=0, tick=140, increments=np.array([0.0, 0.5, -1.5], np.float32)),
+    JumpHead(epoch=5, next_sequence=1, done=139, phase="flying"),
+    JournalPage(epoch=5, next_sequence=2, jumps=(b"\x00one", b"two")),
+    MissionPhase(phase="finished", reason="J fällt unter 0,1"),
+    ROW,
+    Status(
+        phase="flying",
+        activity="mapping",
+        tick=20,
+        time_s=1.5,
+        importance=0.5,
+        f_score_visible=0.25,
+        f_score_objects=0.125,
+        keyframes=3,
+        dropped=1,
+        keyframes_per_s=2.5,
+        jumps=1,
+        min_separation_m=1.5,
+        drones=(ROW,),
+    ),
+)
+each_message = pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: message.name)
+each_array = pytest.mark.parametrize("dtype", ["<f4", "<f8", "<i4", "|u1"])
+
+
+def unpacked(message: Message) -> dict[str, Any]:
+    fields: dict[str, Any] = msgpack.unpackb(encode(message))
+    return fields
+
+
+def places(tree: object, here: Place = ()) -> Iterator[tuple[Place, object]]:
+    """Every value inside of a tree of maps and lists, the version and the message's name left out."""
+    inner = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
+    for key, value in inner:
+        if here or key not in ("v", "n"):
+            yield (*here, key), value
+            yield from places(value, (*here, key))
+
+
+def replaced(fields: dict[str, Any], place: Place, value: object) -> bytes:
+    """The same message with one value exchanged."""
+    changed = copy.deepcopy(fields)
+    inner: Any = changed
+    for key in place[:-1]:
+        inner = inner[key]
+    inner[place[-1]] = value
+    packed: bytes = msgpack.packb(changed)
+    return packed
+
+
+def assert_same(one: Message, other: Message) -> None:
+    assert type(one) is type(other)
+    for field in type(one).model_fields:
+        a, b = getattr(one, field), getattr(other, field)
+        if isinstance(a, np.ndarray):
+            assert a.dtype == b.dtype
+            np.testing.assert_array_equal(a, b)
+        else:
+            assert a == b
+
+
+def jump_bytes(increments: object) -> bytes:
+    return replaced(
+        unpacked(Jump(epoch=5, sequence=0, tick=1, increments=np.zeros(1, "<f4"))), ("increments",), increments
+    )
+
+
+def test_no_message_is_missing_from_the_examples() -> None:
+    defined = {kind for kind in vars(messages).values() if isinstance(kind, type) and issubclass(kind, Message)}
+
+    assert {type(message) for message in EXAMPLES} == defined - {Message}
+
+
+def test_no_field_takes_the_place_of_the_version_or_the_name() -> None:
+    assert all(type(message).model_fields.keys().isdisjoint({"v", "n"}) for message in EXAMPLES)
+
+
+@each_message
+def test_a_message_comes_out_as_it_went_in(message: Message) -> None:
+    assert_same(decode(type(message), encode(message)), message)
+
+
+@each_array
+@pytest.mark.parametrize("shape", [(6,), (2, 3), (0,), (0, 4), ()])
+def test_an_array_keeps_its_type_shape_and_values(dtype: str, shape: tuple[int, ...]) -> None:
+    array = np.arange(math.prod(shape)).reshape(shape).astype(dtype)
+
+    found = decode(Jump, encode(Jump(epoch=1, sequence=0, tick=0, increments=array))).increments
+
+    assert found.dtype == np.dtype(dtype)
+    assert found.shape == shape
+    np.testing.assert_array_equal(found, array)
+
+
+def test_an_array_crosses_as_little_endian_bytes_whatever_its_own_order() -> None:
+    for array in (np.array([1.0, -2.0], ">f4"), np.array([1.0, -2.0], "<f4"), np.array([1.0, 9.0, -2.0], "<f4")[::2]):
+        fields = unpacked(Jump(epoch=1, sequence=0, tick=0, increments=array))
+
+        assert fields["increments"] == ["<f4", [2], b"\x00\x00\x80\x3f\x00\x00\x00\xc0"]
+
+
+@pytest.mark.parametrize("version", [WIRE_VERSION + 1, 0, None, "1", True, float(WIRE_VERSION), [1]])
+def test_another_version_is_refused(version: object) -> None:
+    with pytest.raises(VersionError, match=r"jump_head: wire version .* speaks 1"):
+        decode(JumpHead, msgpack.packb(unpacked(EXAMPLES[7]) | {"v": version}))
+
+
+def test_a_message_of_another_name_is_refused() -> None:
+    with pytest.raises(MessageError, match="drone_status: holds a message 'status'"):
+        decode(DroneStatus, encode(EXAMPLES[-1]))
+    with pytest.raises(MessageError, match="jump_head: holds a message None"):
+        decode(JumpHead, msgpack.packb({"v": 1, "epoch": 5, "next_sequence": 1, "done": 139, "phase": "flying"}))
+
+
+@each_message
+def test_every_field_is_required(message: Message) -> None:
+    for field in type(message).model_fields:
+        fields = unpacked(message)
+        del fields[field]
+        with pytest.raises(MessageError, match=rf"{message.name}\.{field}: Field required"):
+            decode(type(message), msgpack.packb(fields))
+
+
+@each_message
+def test_an_unknown_field_is_refused_at_every_depth(message: Message) -> None:
+    fields = unpacked(message)
+    tables = [(), *(place for place, value in places(fields) if isinstance(value, dict))]
+    for table in tables:
+        with pytest.raises(MessageError, match="not permitted"):
+            decode(type(message), replaced(fields, (*table, "surprise"), 1))
+
+
+@each_message
+def test_a_number_that_is_not_finite_is_refused_wherever_it_stands(message: Message) -> None:
+    fields = unpacked(message)
+    for place, value in places(fields):
+        if isinstance(value, float):
+            for bad in (math.nan, math.inf, -math.inf):
+                with pytest.raises(MessageError):
+                    decode(type(message), replaced(fields, place, bad))
+
+
+@each_message
+def test_a_value_of_another_type_is_refused_wherever_it_stands(message: Message) -> None:
+    """Nothing is converted: no "3" for 3, no true for 1, no 1.0 for 1, no text for bytes."""
+    fields = unpacked(message)
+    for place, value in places(fields):
+        others: list[object] = ["3", b"3", True, None, 2.5, 3, [], {}]
+        same_kind = (int, float) if type(value) is float else (type(value),)
+        for other in others:
+            if type(other) in same_kind or (other is None and place[-1] == "control"):
+                continue
+            with pytest.raises(MessageError):
+                decode(type(message), replaced(fields, place, other))
+
+
+def test_numbers_out_of_range_are_refused() -> None:
+    for field, bad in [("drone", 0), ("drone", 256), ("tick", -1), ("battery", 1.01), ("battery", -0.01)]:
+        with pytest.raises(MessageError, match=rf"state\.{field}: "):
+            decode(DroneState, replaced(unpacked(EXAMPLES[4]), (field,), bad))
+
+
+@each_message
+def test_truncated_bytes_are_refused_wherever_they_end(message: Message) -> None:
+    data = encode(message)
+    for length in range(len(data)):
+        with pytest.raises(MessageError):
+            decode(type(message), data[:length])
+
+
+def test_bytes_behind_a_message_are_refused() -> None:
+    with pytest.raises(MessageError, match="extra data"):
+        decode(MissionPhase, encode(EXAMPLES[9]) + b"\x00")
+
+
+@pytest.mark.parametrize(
+    ("increments", "fault"),
+    [
+        (["<f4", [2], bytes(7)], "7 bytes do not fill shape"),
+        (["<f4", [2], bytes(12)], "12 bytes do not fill shape"),
+        (["<f8", [2], bytes(8)], "8 bytes do not fill shape"),
+        (["<f4", [2**40, 2**40], b""], "0 bytes do not fill shape"),
+        (["<f4", [-1, -2], bytes(8)], "not made of lengths"),
+        (["<f4", [True, 2], bytes(8)], "not made of lengths"),
+        (["<f4", [2.0], bytes(8)], "not made of lengths"),
+        (["<f4", [0, 2**64 - 1], b""], ""),
+        (["<f4", [0] * 70, b""], ""),
+        ([">f4", [2], bytes(8)], "not an array"),
+        (["|O", [1], bytes(8)], "not an array"),
+        (["<f4", 2, bytes(8)], "not an array"),
+        (["<f4", [2], "12345678"], "not an array"),
+        ([1.0, 2.0], "not an array"),
+        (["<f4", [1], np.float32(np.nan).tobytes()], "not finite"),
+        (["<f8", [1], np.float64(-np.inf).tobytes()], "not finite"),
+    ],
+)
+def test_an_array_that_does_not_fit_is_refused(increments: object, fault: str) -> None:
+    with pytest.raises(MessageError, match=rf"jump\.increments: .*{fault}"):
+        decode(Jump, jump_bytes(increments))
+
+
+@pytest.mark.parametrize("increments", [np.array([np.nan], np.float32), np.zeros(2, np.int64), np.array(["text"])])
+def test_what_every_receiver_would_refuse_cannot_be_made_into_a_message(increments: np.ndarray) -> None:
+    with pytest.raises(ValidationError):
+        Jump(epoch=1, sequence=0, tick=0, increments=increments)
+
+
+def test_a_message_beyond_the_limit_is_refused_by_sender_and_receiver() -> None:
+    frame = EXAMPLES[5]
+    room = MAX_MESSAGE_BYTES - len(encode(frame.model_copy(update={"jpeg": bytes(2**16)}))) + 2**16
+    largest = frame.model_copy(update={"jpeg": bytes(room)})
+    assert len(encode(largest)) == MAX_MESSAGE_BYTES
+    decode(Keyframe, encode(largest))
+
+    with pytest.raises(MessageError, match="exceed the limit"):
+        encode(frame.model_copy(update={"jpeg": bytes(room + 1)}))
+    with pytest.raises(MessageError, match="exceed the limit"):
+        decode(Keyframe, encode(largest) + b"\x00")
+
+
+reproducible = settings(max_examples=200, deadline=None, derandomize=True)
+numbers = st.integers(-(2**63), 2**64 - 1) | st.floats() | st.booleans()
+leaves = (
+    st.none()
+    | numbers
+    | st.text(max_size=8)
+    | st.binary(max_size=16)
+    | st.sampled_from(["<f4", "<f8", "<i4", "|u1", "jump", "flying"])
+    | st.builds(msgpack.ExtType, st.integers(0, 127), st.binary(max_size=8))
+    | st.builds(msgpack.Timestamp, st.integers(0, 2**40), st.integers(0, 10**9 - 1))
+)
+structures = st.recursive(
+    leaves,
+    lambda inner: (
+        st.lists(inner, max_size=4)
+        | st.dictionaries(st.text(max_size=8) | st.binary(max_size=4), inner, max_size=4)
+        | st.tuples(st.sampled_from(["<f4", "|u1"]), st.lists(numbers, max_size=4), st.binary(max_size=16))
+    ),
+    max_leaves=12,
+)
+
+
+def decode_or_refuse(kind: type[Message], data: bytes) -> None:
+    try:
+        message = decode(kind, data)
+    except MessageError:
+        return
+    assert_same(decode(kind, encode(message)), message)
+
+
+@reproducible
+@given(data=st.binary(max_size=200), message=st.sampled_from(EXAMPLES))
+def test_arbitrary_bytes_raise_nothing_but_message_errors(data: bytes, message: Message) -> None:
+    decode_or_refuse(type(message), data)
+
+
+@reproducible
+@given(structure=structures, message=st.sampled_from(EXAMPLES))
+def test_arbitrary_structures_raise_nothing_but_message_errors(structure: object, message: Message) -> None:
+    with pytest.raises(MessageError):
+        decode(type(message), msgpack.packb(structure))
+
+
+@reproducible
+@given(data=st.data(), message=st.sampled_from(EXAMPLES))
+def test_a_message_with_anything_in_one_place_raises_nothing_but_message_errors(
+    data: st.DataObject, message: Message
+) -> None:
+    fields = unpacked(message)
+    place, _ = data.draw(st.sampled_from(list(places(fields))))
+    decode_or_refuse(type(message), replaced(fields, place, data.draw(structures)))
+
+
+@reproducible
+@given(data=st.data(), message=st.sampled_from(EXAMPLES))
+def test_a_message_with_a_flipped_bit_raises_nothing_but_message_errors(data: st.DataObject, message: Message) -> None:
+    encoded = bytearray(encode(message))
+    encoded[data.draw(st.integers(0, len(encoded) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    decode_or_refuse(type(message), bytes(encoded))
