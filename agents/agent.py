@@ -46,7 +46,7 @@ class Agent:
     def __init__(self, mission: Mission, drone: int, bus: Bus, *, lockstep: bool) -> None:
         self._mission, self._drone, self._bus = mission, drone, bus
         self._patience_s = LOCKSTEP_PATIENCE_S if lockstep else REAL_TIME_PATIENCE_S
-        starts = {other.id: np.array(other.start) for other in mission.drones}
+        starts = {other.id: other.start for other in mission.drones}
         self._log = StateLog()
         self._team = Team(drone, starts, mission.flight, mission.tick_s)
         self._replica = Replica(ImportanceField(VirtualField.of(mission.target), mission.sensing))

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from protocol.geometry import Floats
 from protocol.mission import Flight, Mission
@@ -44,8 +45,8 @@ class Rows:
 
     def margin(self, kind: str, without: float) -> float:
         """Smallest barrier among the rows of one kind; ``without`` if there is none."""
-        chosen = [b for name, b in zip(self.names, self.barriers, strict=True) if name.startswith(kind)]
-        return float(min(chosen, default=without))
+        chosen = [k for k, name in enumerate(self.names) if name.startswith(kind)]
+        return float(self.barriers[chosen].min()) if chosen else without
 
 
 ROOT_STEPS = 40
@@ -107,20 +108,11 @@ class Barriers:
         half of the closing speed that keeps b from becoming negative. A neighbour that has been silent for ``age``
         keeps its place, and D grows by ``age`` times its top speed.
         """
-        count = FIXED_ROWS + len(neighbours)
-        coefficients, barriers = np.zeros((count, 5)), np.empty(count)
-        coefficients[:FIXED_ROWS] = self._region
-        away = predicted[4] - self._pitch_mid
-        coefficients[0, 4] = -2 * away
-        barriers[0] = self._pitch_reach - away * away
-        barriers[1:4] = predicted[:3]
-        barriers[4:7] = -predicted[:3]
-        barriers[1:7] -= self._faces
-        if neighbours:
-            offsets = predicted[:3] - np.array([neighbour.position for neighbour in neighbours])
-            distances = self._wide + self._top_speed * np.array([neighbour.age_s for neighbour in neighbours])
-            coefficients[FIXED_ROWS:, :3] = 2 * offsets
-            barriers[FIXED_ROWS:] = (offsets * offsets).sum(axis=1) - distances * distances
+        positions = np.array([neighbour.position for neighbour in neighbours]).reshape(-1, 3)
+        distances = np.array([self._wide + neighbour.age_s * self._top_speed for neighbour in neighbours])
+        coefficients, barriers = _rows(
+            predicted, positions, distances, self._region, self._faces, self._pitch_mid, self._pitch_reach
+        )
         bounds = -self._gain * barriers
         bounds[0] = -self._pitch_gain * barriers[0]
         names = (PITCH, *REGION, *[f"separation:{neighbour.drone}" for neighbour in neighbours])
@@ -135,3 +127,33 @@ class Barriers:
         low = np.minimum(np.maximum(-self._speed, velocity - self._change), 0.0)
         high = np.maximum(np.minimum(self._speed, velocity + self._change), 0.0)
         return low, high
+
+
+@njit(cache=True, nogil=True)
+def _rows(
+    predicted: Floats,
+    positions: Floats,
+    distances: Floats,
+    region: Floats,
+    faces: Floats,
+    pitch_mid: float,
+    pitch_reach: float,
+) -> tuple[Floats, Floats]:
+    """Coefficients (rows, 5) and barriers (rows,): pitch, six faces, and one for each of ``positions`` (n, 3)."""
+    count = FIXED_ROWS + positions.shape[0]
+    coefficients, barriers = np.zeros((count, 5)), np.empty(count)
+    coefficients[:FIXED_ROWS] = region
+    away = predicted[4] - pitch_mid
+    coefficients[0, 4] = -2 * away
+    barriers[0] = pitch_reach - away * away
+    for axis in range(3):
+        barriers[1 + axis] = predicted[axis] - faces[axis]
+        barriers[4 + axis] = -predicted[axis] - faces[3 + axis]
+    for k in range(positions.shape[0]):
+        square = 0.0
+        for axis in range(3):
+            offset = predicted[axis] - positions[k, axis]
+            coefficients[FIXED_ROWS + k, axis] = 2 * offset
+            square += offset * offset
+        barriers[FIXED_ROWS + k] = square - distances[k] * distances[k]
+    return coefficients, barriers

@@ -2,33 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from agents.barriers import Neighbour, predicted_pose
-from protocol.geometry import Floats
 from protocol.messages import DroneState
 from protocol.mission import Flight
 
 
 class Team:
-    """``starts`` are poses (5,) of the whole team, so that a drone that never speaks is an obstacle at its start."""
+    """``starts`` are poses of the whole team, so that a drone that never speaks is an obstacle at its start."""
 
-    def __init__(self, own: int, starts: Mapping[int, Floats], flight: Flight, tick_s: float) -> None:
+    def __init__(self, own: int, starts: Mapping[int, Sequence[float]], flight: Flight, tick_s: float) -> None:
         self._own, self._flight, self._tick_s = own, flight, tick_s
-        self._last_seen = {drone: (0, start) for drone, start in starts.items() if drone != own}
+        self._last_seen: dict[int, tuple[int, Sequence[float], Sequence[float]]] = {
+            drone: (0, start, (0.0,) * 5) for drone, start in starts.items() if drone != own
+        }
 
     def hear(self, state: DroneState) -> None:
         """An older state never replaces a newer one."""
-        if state.drone == self._own or self._last_seen.get(state.drone, (0, None))[0] > state.tick:
-            return
-        predicted = predicted_pose(np.array(state.pose), np.array(state.velocity), self._flight)
-        self._last_seen[state.drone] = (state.tick, predicted)
+        known = self._last_seen.get(state.drone)
+        if state.drone != self._own and (known is None or known[0] <= state.tick):
+            self._last_seen[state.drone] = (state.tick, state.pose, state.velocity)
 
     def neighbours(self, tick: int) -> list[Neighbour]:
         """All the others at ``tick``, ascending by id; the longer silent, the larger."""
+        others = sorted(self._last_seen.items())
+        poses = np.array([pose for _, (_, pose, _) in others]).reshape(-1, 5)
+        velocities = np.array([velocity for _, (_, _, velocity) in others]).reshape(-1, 5)
+        predicted = predicted_pose(poses, velocities, self._flight)
         return [
-            Neighbour(drone, predicted[:3], max(0, tick - seen) * self._tick_s)
-            for drone, (seen, predicted) in sorted(self._last_seen.items())
+            Neighbour(drone, predicted[row, :3], max(0, tick - seen) * self._tick_s)
+            for row, (drone, (seen, _, _)) in enumerate(others)
         ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,8 +42,9 @@ class ImportanceField:
         self._sensing = sensing
         self._sigmas = (sensing.sigma_axis, sensing.sigma_view, sensing.sigma_distance_m)
         self._total = float(field.size)
-        per_stride = field.size / SHARE_SAMPLES
-        self._stride = max(1, int(np.ceil(per_stride**0.25)))  # three lattice axes and the direction table
+        self._stride = max(1, math.ceil(field.size / SHARE_SAMPLES))
+        while any(math.gcd(self._stride, len(axis)) > 1 for axis in (field.xs, field.ys, field.zs)):
+            self._stride += 1
 
     @property
     def importance(self) -> float:

@@ -34,13 +34,13 @@ _TWO_TO_MINUS = tuple(
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _exp_negative(x: Singles, bits: NDArray[np.int32], result: Singles) -> None:
+def _exp_negative(x: Singles, bits: NDArray[np.int32], powers: Singles, result: Singles) -> None:
     """``result <- exp(-x)`` for 0 <= x <= EXPONENT_LIMIT; written so that the compiler vectorises it.
 
-    exp(-x) = 2^-n 2^-f with n whole and f in [0, 1): 2^-n is made from its bits, 2^-f by a polynomial.
+    exp(-x) = 2^-n 2^-f with n whole and f in [0, 1): 2^-n is made from its bits, 2^-f by a polynomial. ``powers``
+    is the memory of ``bits`` seen as float32.
     """
     c0, c1, c2, c3, c4, c5, c6 = _TWO_TO_MINUS
-    powers = bits.view(np.float32)
     for j in range(x.size):
         y = x[j] * _LOG2_E
         n = np.int32(y)
@@ -51,52 +51,83 @@ def _exp_negative(x: Singles, bits: NDArray[np.int32], result: Singles) -> None:
         result[j] *= powers[j]
 
 
+LANES = 8
+"""Direction tables are padded to a multiple of this, so that vectorised loops have no rest."""
+
+
 @njit(cache=True, nogil=True, fastmath=True)
-def _decay_uncontested(
+def _decay_position(
     phi: Singles,
-    views: Singles,
-    sight: Singles,
-    base: float,
+    row: int,
+    x: Singles,
+    y: Singles,
+    z: Singles,
+    seen: int,
+    sight: Floats,
+    base: Floats,
+    mine: int,
     k2: float,
     cut: float,
     rate: float,
-    scratch: Singles,
+    exponent: Singles,
+    owner: NDArray[np.int32],
+    h: Singles,
+    values: Singles,
     bits: NDArray[np.int32],
+    powers: Singles,
 ) -> tuple[float, float, float, float, float, float, float]:
-    """All directions of one position that a single drone senses; ``phi`` (directions,) decays in place.
+    """All directions of one position that ``seen`` drones sense; row ``row`` of ``phi`` decays in place.
 
-    views: (3, directions) Dir(q) by component. sight: (3,) unit line of sight. base: exponent of the position.
-    rate: delta_1 dt. scratch: (3, directions). Returns the sums over h phi of 1, h, t c2, t Dir, with
-    t = 1 - c2, and how much phi lost.
+    x, y, z: (padded directions,) components of Dir(q), zero in the padding. sight: (seen, 3) unit lines of sight.
+    base: (seen,) exponents of the position. mine: which of them is the drone whose sums are wanted, or -1.
+    rate: delta_1 dt. Scratch, all (padded directions,) and made once, because making a view costs as much as the
+    arithmetic: exponent, owner, h, values (zero in the padding), bits and powers (`_exp_negative`).
+    Returns the sums over own h phi of 1, h, t c2, t Dir, with t = 1 - c2, and how much phi lost.
     """
-    x, y, z = views[0], views[1], views[2]
-    exponent, h, factor = scratch[0], scratch[1], scratch[2]
-    ex, ey, ez = sight[0], sight[1], sight[2]
-    base32, k32, cut32, rate32 = np.float32(base), np.float32(k2), np.float32(cut), np.float32(rate)
-    for j in range(phi.size):
-        t = _ONE + (x[j] * ex + y[j] * ey + z[j] * ez)
-        exponent[j] = min(base32 + t * t * k32, _LIMIT)
-    _exp_negative(exponent, bits, h)
+    k32, cut32, rate32 = np.float32(k2), np.float32(cut), np.float32(rate)
+    for j in range(phi.shape[1]):
+        values[j] = phi[row, j]
+    for j in range(exponent.size):
+        exponent[j] = _LIMIT
+        owner[j] = -1
+    for s in range(seen):
+        ex, ey, ez, base32 = (
+            np.float32(sight[s, 0]),
+            np.float32(sight[s, 1]),
+            np.float32(sight[s, 2]),
+            np.float32(base[s]),
+        )
+        for j in range(exponent.size):
+            t = _ONE + (x[j] * ex + y[j] * ey + z[j] * ez)
+            candidate = base32 + t * t * k32
+            better = candidate < exponent[j]
+            exponent[j] = candidate if better else exponent[j]
+            owner[j] = np.int32(s) if better else owner[j]
+    _exp_negative(exponent, bits, powers, h)
+    for j in range(exponent.size):
+        h[j] = h[j] if exponent[j] <= cut32 else _ZERO
     sum_h, sum_hh, sum_tc = _ZERO, _ZERO, _ZERO
     tx, ty, tz = _ZERO, _ZERO, _ZERO
-    for j in range(phi.size):
-        sensed = h[j] if exponent[j] <= cut32 else _ZERO
-        t = _ONE + (x[j] * ex + y[j] * ey + z[j] * ez)
-        weight = sensed * phi[j]
-        weight_t = weight * t
-        sum_h += weight
-        sum_hh += sensed * weight
-        sum_tc += weight_t * (_ONE - t)
-        tx += weight_t * x[j]
-        ty += weight_t * y[j]
-        tz += weight_t * z[j]
-        exponent[j] = min(rate32 * sensed, _LIMIT)
-    _exp_negative(exponent, bits, factor)
+    if mine >= 0:
+        ex, ey, ez = np.float32(sight[mine, 0]), np.float32(sight[mine, 1]), np.float32(sight[mine, 2])
+        for j in range(exponent.size):
+            t = _ONE + (x[j] * ex + y[j] * ey + z[j] * ez)
+            weight = h[j] * values[j] if owner[j] == mine else _ZERO
+            weight_t = weight * t
+            sum_h += weight
+            sum_hh += h[j] * weight
+            sum_tc += weight_t * (_ONE - t)
+            tx += weight_t * x[j]
+            ty += weight_t * y[j]
+            tz += weight_t * z[j]
+    for j in range(exponent.size):
+        exponent[j] = min(rate32 * h[j], _LIMIT)
+    _exp_negative(exponent, bits, powers, h)
     removed = 0.0
-    for j in range(phi.size):
-        after = phi[j] * factor[j]
-        removed += np.float64(phi[j]) - np.float64(after)
-        phi[j] = after
+    for j in range(phi.shape[1]):
+        after = values[j] * h[j]
+        removed += np.float64(values[j]) - np.float64(after)
+        phi[row, j] = after
     return sum_h, sum_hh, sum_tc, tx, ty, tz, removed
 
 
@@ -168,24 +199,30 @@ def decay_and_terms(
     for i in range(drones):
         axes[i], boxes[i] = _describe(poses[i], s1, s3, distance, cut, xs, ys, zs)
 
+    reach = math.sqrt(2.0 * cut)
+    nearest = max(1e-9, distance - s3 * reach) ** 2
+    farthest = (distance + s3 * reach) ** 2
+    narrow = s1 * reach < 1.0  # the view cone is narrower than a half space
+
     gradient = np.zeros(5)
     first, second, removed = 0.0, 0.0, 0.0
-    # Drones that can sense the position at hand: their row, exponent of position, and unit line of sight.
-    who = np.empty(drones, np.int64)
+    # Of the drones that can sense the position at hand: exponent of position, and unit line of sight.
     base = np.empty(drones)
     sight = np.empty((drones, 3))
-    views = np.empty((3, rows), np.float32)
+    padded = (rows + LANES - 1) // LANES * LANES
+    views_x, views_y, views_z = np.zeros(padded, np.float32), np.zeros(padded, np.float32), np.zeros(padded, np.float32)
     for j in range(rows):
-        views[0, j], views[1, j], views[2, j] = directions[j, 0], directions[j, 1], directions[j, 2]
-    line = np.empty(3, np.float32)
-    scratch, bits = np.empty((3, rows), np.float32), np.empty(rows, np.int32)
+        views_x[j], views_y[j], views_z[j] = directions[j, 0], directions[j, 1], directions[j, 2]
+    exponents, senses, values = np.empty(padded, np.float32), np.empty(padded, np.float32), np.zeros(padded, np.float32)
+    bits, owners = np.empty(padded, np.int32), np.empty(padded, np.int32)
+    powers = bits.view(np.float32)
 
     for i in range(drones):
         for ix in range(boxes[i, 0], boxes[i, 1]):
             for iy in range(boxes[i, 2], boxes[i, 3]):
                 for iz in range(boxes[i, 4], boxes[i, 5]):
                     seen = 0
-                    mine_r, mine_c1 = 0.0, 0.0
+                    mine, mine_r, mine_c1 = -1, 0.0, 0.0
                     for k in range(drones):
                         inside = (
                             boxes[k, 0] <= ix < boxes[k, 1]
@@ -195,60 +232,39 @@ def decay_and_terms(
                         if not inside:
                             continue
                         dx, dy, dz = xs[ix] - poses[k, 0], ys[iy] - poses[k, 1], zs[iz] - poses[k, 2]
-                        r = math.sqrt(dx * dx + dy * dy + dz * dz)
-                        if r < 1e-9:  # the line of sight has no direction inside the camera
+                        square = dx * dx + dy * dy + dz * dz
+                        along_axis = axes[k, 0] * dx + axes[k, 1] * dy + axes[k, 2] * dz
+                        # Outside the shell or behind the camera, told without a square root. Inside the camera
+                        # itself the line of sight has no direction.
+                        if square < nearest or square > farthest or (narrow and along_axis <= 0.0):
+                            if k == i:
+                                break
                             continue
-                        ex, ey, ez = dx / r, dy / r, dz / r
-                        c1 = axes[k, 0] * ex + axes[k, 1] * ey + axes[k, 2] * ez
+                        r = math.sqrt(square)
+                        c1 = along_axis / r
                         rho = r - distance
                         exponent = (1.0 - c1) * (1.0 - c1) * k1 + rho * rho * k3
                         if exponent > cut:
+                            if k == i:
+                                break
                             continue
-                        who[seen], base[seen] = k, exponent
-                        sight[seen, 0], sight[seen, 1], sight[seen, 2] = ex, ey, ez
+                        if k < i:  # visited with drone k's box
+                            break
+                        base[seen] = exponent
+                        sight[seen, 0], sight[seen, 1], sight[seen, 2] = dx / r, dy / r, dz / r
                         seen += 1
                         if k == own:
-                            mine_r, mine_c1 = r, c1
-                    if seen == 0 or who[0] != i:  # each position once: with the lowest row that senses it
+                            mine, mine_r, mine_c1 = seen - 1, r, c1
+                    if seen == 0:  # each position once: with the lowest row that senses it
                         continue
 
                     row = (ix * ys.size + iy) * zs.size + iz
-                    sum_h, sum_hh, sum_tc = 0.0, 0.0, 0.0
-                    tx, ty, tz = 0.0, 0.0, 0.0
-                    if seen == 1:
-                        line[0], line[1], line[2] = sight[0, 0], sight[0, 1], sight[0, 2]
-                        sum_h, sum_hh, sum_tc, tx, ty, tz, lost = _decay_uncontested(
-                            phi[row], views, line, base[0], k2, cut, decay * dt, scratch, bits
-                        )
-                        removed += lost
-                    else:
-                        for j in range(rows):
-                            best, winner, best_t = cut, -1, 0.0
-                            for s in range(seen):
-                                t = 1.0 + (
-                                    directions[j, 0] * sight[s, 0]
-                                    + directions[j, 1] * sight[s, 1]
-                                    + directions[j, 2] * sight[s, 2]
-                                )
-                                exponent = base[s] + t * t * k2
-                                if exponent < best or (winner < 0 and exponent == best):
-                                    best, winner, best_t = exponent, s, t
-                            if winner < 0:
-                                continue
-                            h = math.exp(-best)
-                            value = phi[row, j]
-                            if who[winner] == own:
-                                weight = h * value
-                                sum_h += weight
-                                sum_hh += h * weight
-                                sum_tc += weight * best_t * (1.0 - best_t)
-                                tx += weight * best_t * directions[j, 0]
-                                ty += weight * best_t * directions[j, 1]
-                                tz += weight * best_t * directions[j, 2]
-                            after = np.float32(value * math.exp(-decay * dt * h))
-                            phi[row, j] = after
-                            removed += np.float64(value) - np.float64(after)
-                    if mine_r == 0.0 or sum_h == 0.0:
+                    sum_h, sum_hh, sum_tc, tx, ty, tz, lost = _decay_position(
+                        phi, row, views_x, views_y, views_z, seen, sight, base, mine, k2, cut, decay * dt,
+                        exponents, owners, senses, values, bits, powers,
+                    )  # fmt: skip
+                    removed += lost
+                    if mine < 0 or sum_h == 0.0:
                         continue
 
                     # The chain rule of E, with the parts that are equal for all directions taken out of the sum.
@@ -279,9 +295,10 @@ def owned_shares(
     distance: float,
     stride: int,
 ) -> Floats:
-    """|V_i| / m of every drone, (drones,), from every ``stride``-th cell of each lattice axis and direction.
+    """|V_i| / m of every drone, (drones,), from all directions at every ``stride``-th position; 1 is exact.
 
-    No cut here: every cell has an owner, however badly it is sensed. ``stride`` 1 is exact.
+    No cut here: every cell has an owner, however badly it is sensed. A stride that shares no factor with the
+    lattice's side lengths takes its samples from all of its layers alike.
     """
     s1, s2, s3 = sigmas
     k1, k2, k3 = 0.5 / (s1 * s1), 0.5 / (s2 * s2), 0.5 / (s3 * s3)
@@ -289,27 +306,27 @@ def owned_shares(
     counts = np.zeros(drones)
     base = np.empty(drones)
     sight = np.empty((drones, 3))
-    for ix in range(stride // 2, xs.size, stride):
-        for iy in range(stride // 2, ys.size, stride):
-            for iz in range(min(stride // 2, zs.size - 1), zs.size, stride):
-                for k in range(drones):
-                    dx, dy, dz = xs[ix] - poses[k, 0], ys[iy] - poses[k, 1], zs[iz] - poses[k, 2]
-                    r = max(math.sqrt(dx * dx + dy * dy + dz * dz), 1e-9)
-                    sight[k, 0], sight[k, 1], sight[k, 2] = dx / r, dy / r, dz / r
-                    ax = math.cos(poses[k, 3]) * math.cos(poses[k, 4])
-                    ay = math.sin(poses[k, 3]) * math.cos(poses[k, 4])
-                    c1 = ax * sight[k, 0] + ay * sight[k, 1] - math.sin(poses[k, 4]) * sight[k, 2]
-                    base[k] = (1.0 - c1) * (1.0 - c1) * k1 + (r - distance) * (r - distance) * k3
-                for j in range(min(stride // 2, directions.shape[0] - 1), directions.shape[0], stride):
-                    best, winner = np.inf, 0
-                    for k in range(drones):
-                        c2 = -(
-                            directions[j, 0] * sight[k, 0]
-                            + directions[j, 1] * sight[k, 1]
-                            + directions[j, 2] * sight[k, 2]
-                        )
-                        exponent = base[k] + (1.0 - c2) * (1.0 - c2) * k2
-                        if exponent < best:
-                            best, winner = exponent, k
-                    counts[winner] += 1.0
+    axes = np.empty((drones, 3))
+    for k in range(drones):
+        axes[k, 0] = math.cos(poses[k, 3]) * math.cos(poses[k, 4])
+        axes[k, 1] = math.sin(poses[k, 3]) * math.cos(poses[k, 4])
+        axes[k, 2] = -math.sin(poses[k, 4])
+    for row in range(stride // 2, xs.size * ys.size * zs.size, stride):
+        x, y, z = xs[row // (ys.size * zs.size)], ys[row // zs.size % ys.size], zs[row % zs.size]
+        for k in range(drones):
+            dx, dy, dz = x - poses[k, 0], y - poses[k, 1], z - poses[k, 2]
+            r = max(math.sqrt(dx * dx + dy * dy + dz * dz), 1e-9)
+            sight[k, 0], sight[k, 1], sight[k, 2] = dx / r, dy / r, dz / r
+            c1 = axes[k, 0] * sight[k, 0] + axes[k, 1] * sight[k, 1] + axes[k, 2] * sight[k, 2]
+            base[k] = (1.0 - c1) * (1.0 - c1) * k1 + (r - distance) * (r - distance) * k3
+        for j in range(directions.shape[0]):
+            best, winner = np.inf, 0
+            for k in range(drones):
+                t = 1.0 + (
+                    directions[j, 0] * sight[k, 0] + directions[j, 1] * sight[k, 1] + directions[j, 2] * sight[k, 2]
+                )
+                exponent = base[k] + t * t * k2
+                if exponent < best:
+                    best, winner = exponent, k
+            counts[winner] += 1.0
     return counts / counts.sum()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 
@@ -17,10 +17,10 @@ class StateLog:
     """Takes states of any drone in any order."""
 
     def __init__(self) -> None:
-        self._poses: dict[int, dict[int, Floats]] = {}
+        self._poses: dict[int, dict[int, Sequence[float]]] = {}
 
     def hear(self, state: DroneState) -> None:
-        self._poses.setdefault(state.tick, {})[state.drone] = np.array(state.pose)
+        self._poses.setdefault(state.tick, {})[state.drone] = state.pose
 
     def has_all(self, tick: int, drones: Collection[int]) -> bool:
         return self._poses.get(tick, {}).keys() >= set(drones)

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from protocol.geometry import Floats
 from protocol.mission import Flight
@@ -37,18 +38,28 @@ class VehicleBody:
         """
         if now_s - self.commanded_at_s > flight.setpoint_timeout_s:
             self.commanded = np.zeros(5)
-        tau = flight.response_time_s
-        limit = np.array([flight.acceleration_max_mps2] * 3 + [flight.angular_acceleration_max_radps2] * 2)
-        wanted = self.commanded - self.velocity
-        if tau > 0:
-            change = wanted * -math.expm1(-dt / tau)
-            # Mean velocity over the step of an exponential approach, from its integral.
-            travelled = self.commanded * dt - wanted * tau * -math.expm1(-dt / tau)
+        limits = (flight.acceleration_max_mps2, flight.angular_acceleration_max_radps2)
+        self.pose, self.velocity = _follow(
+            self.pose, self.velocity, self.commanded, limits, flight.response_time_s, dt
+        )
+
+
+@njit(cache=True, nogil=True)
+def _follow(
+    pose: Floats, velocity: Floats, commanded: Floats, limits: tuple[float, float], tau: float, dt: float
+) -> tuple[Floats, Floats]:
+    """Pose and velocity (5,) after ``dt``; ``limits`` are the accelerations of position and of the camera's angles."""
+    approach = 1.0 if tau == 0 else -math.expm1(-dt / tau)
+    new_pose, new_velocity = pose.copy(), velocity.copy()
+    for axis in range(5):
+        limit = limits[0] if axis < 3 else limits[1]
+        wanted = commanded[axis] - velocity[axis]
+        if abs(wanted) > limit * max(tau, dt):  # the whole step at full acceleration
+            change = math.copysign(min(limit * dt, abs(wanted * approach)), wanted)
+            new_pose[axis] += velocity[axis] * dt + change * dt / 2
         else:
-            change, travelled = wanted, self.commanded * dt
-        clipped = np.clip(change, -limit * dt, limit * dt)
-        straight = self.velocity * dt + clipped * dt / 2
-        saturated = np.abs(wanted) > limit * max(tau, dt)
-        self.pose = self.pose + np.where(saturated, straight, travelled)
-        self.velocity = self.velocity + np.where(saturated, clipped, change)
-        self.pose[3] = math.remainder(self.pose[3], 2 * math.pi)
+            change = wanted * approach
+            new_pose[axis] += commanded[axis] * dt - wanted * tau * approach  # integral of the approach
+        new_velocity[axis] += change
+    new_pose[3] = (new_pose[3] + math.pi) % (2 * math.pi) - math.pi
+    return new_pose, new_velocity

@@ -150,7 +150,7 @@ class Simulator:
 
     async def _wait_for_agents(self, tick: int) -> None:
         def answered() -> bool:
-            return all(self._answered[drone] >= tick for drone in self._live())
+            return all(last >= tick or not self._is_live(drone) for drone, last in self._answered.items())
 
         if not await self._bus.until(answered, LOCKSTEP_PATIENCE_S):
             late = {drone for drone in self._live() if self._answered[drone] < tick}

@@ -59,6 +59,11 @@ def decide(
     return controller.decide(pose, velocity, neighbours, terms, CELLS), program
 
 
+def beside(drone: int, x: float, y: float, z: float) -> Neighbour:
+    """A neighbour at an offset from `POSE`, metres."""
+    return Neighbour(drone, POSE[:3] + np.array([x, y, z]), 0.0)
+
+
 def test_what_the_solver_solved_is_flown() -> None:
     decision, _ = decide("solved", [])
 
@@ -82,8 +87,7 @@ def test_any_other_outcome_brakes_and_is_told(outcome: Outcome) -> None:
 def test_a_drone_that_is_too_near_moves_away_instead_of_standing_there(
     outcome: Outcome, offset: tuple[float, float, float]
 ) -> None:
-    near = Neighbour(2, POSE[:3] + offset, 0.0)
-    far = Neighbour(3, POSE[:3] + [0.0, 0.0, 3.0], 0.0)
+    near, far = beside(2, *offset), beside(3, 0, 0, 3)
 
     decision, _ = decide(outcome, [far, near])
 
@@ -94,7 +98,7 @@ def test_a_drone_that_is_too_near_moves_away_instead_of_standing_there(
 
 
 def test_of_two_that_are_too_near_the_nearest_is_fled() -> None:
-    left, right = Neighbour(2, POSE[:3] + [0, 0.8, 0], 0.0), Neighbour(3, POSE[:3] + [0.5, 0, 0], 0.0)
+    left, right = beside(2, 0, 0.8, 0), beside(3, 0.5, 0, 0)
 
     decision, _ = decide("infeasible", [left, right])
 
@@ -102,7 +106,7 @@ def test_of_two_that_are_too_near_the_nearest_is_fled() -> None:
 
 
 def test_a_drone_between_two_stands_still_rather_than_flee_into_the_other() -> None:
-    one, other = Neighbour(2, POSE[:3] + [0.5, 0, 0], 0.0), Neighbour(3, POSE[:3] - [0.6, 0, 0], 0.0)
+    one, other = beside(2, 0.5, 0, 0), beside(3, -0.6, 0, 0)
 
     decision, _ = decide("infeasible", [one, other])
 
@@ -127,7 +131,7 @@ def test_a_drone_does_not_flee_out_of_its_region() -> None:
 
 
 def test_two_drones_at_the_very_same_place_stand_still() -> None:
-    decision, _ = decide("numerical", [Neighbour(2, POSE[:3].copy(), 0.0)])
+    decision, _ = decide("numerical", [beside(2, 0, 0, 0)])
 
     assert decision.velocity.tolist() == [0.0] * 5
 
@@ -146,10 +150,7 @@ def test_telemetry_that_is_no_number_brakes() -> None:
 def test_more_neighbours_than_expected_are_all_kept_clear_of() -> None:
     controller = CoverageController(MISSION, neighbours=1)
     angles = np.arange(5) * 2 * math.pi / 5
-    ring = [
-        Neighbour(k + 2, POSE[:3] + 1.2 * np.array([math.cos(angle), math.sin(angle), 0.0]), 0.0)
-        for k, angle in enumerate(angles)
-    ]
+    ring = [beside(k + 2, 1.2 * math.cos(angle), 1.2 * math.sin(angle), 0) for k, angle in enumerate(angles)]
 
     decision = controller.decide(POSE, STILL, ring, WISH, CELLS)
 
@@ -189,7 +190,7 @@ def test_the_sampling_row_is_the_barrier_condition_of_the_drones_own_share_of_th
     """
     rng = np.random.default_rng(seed)
     cells = VirtualField.of(MISSION.target)
-    poses = np.array([POSE, POSE + [0.5, 0.4, 0.2, 0.3, 0.1]])
+    poses = POSE + np.array([[0, 0, 0, 0, 0], [0.5, 0.4, 0.2, 0.3, 0.1]])
     replica = ImportanceField(cells, MISSION.sensing)
     replica.phi[:] = rng.uniform(0, 2, cells.shape)
     phi = replica.phi.astype(np.float64)

@@ -106,14 +106,12 @@ def test_the_coarse_lattice_estimates_owned_cells_within_a_hundredth_of_the_fiel
     field = VirtualField.of(TARGET)
     for team in (close_team, random_team):
         poses = team(drones, seed=3)
-        exact = owned_shares(
-            field.xs, field.ys, field.zs, field.directions, poses, (0.07, 0.095, 0.3), 1.0, stride=1
-        )
+        exact = owned_shares(field.xs, field.ys, field.zs, field.directions, poses, (0.07, 0.095, 0.3), 1.0, stride=1)
         with np.errstate(divide="ignore"):
             h = np.stack([np.log(dense_h1(pose, field, Sensing())) for pose in poses])
         known = np.isfinite(h).any(axis=0)  # where the dense product underflows to zero it cannot tell
         owners = np.bincount(h.argmax(axis=0)[known], minlength=drones)
-        assert np.abs(exact * field.size - owners).max() <= field.size - known.sum()
+        assert np.abs(exact * field.size - owners).max() <= field.size - known.sum() + 1e-6
         assert ImportanceField(field, Sensing()).owned_cells(poses) / field.size == pytest.approx(exact, abs=0.01)
 
 

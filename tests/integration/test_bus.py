@@ -1,0 +1,383 @@
+"""Processes hear each other over real zenoh, and what goes wrong is an error, a count or a missing life."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import AsyncIterator, Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deploy.run_folder import socket_endpoint, socket_folder_parent
+from protocol import topics
+from protocol.bus import Bus, connect, parse_parameters
+from protocol.errors import BusError, NoReply
+from protocol.guard import ROOT
+from protocol.messages import DroneState, JournalPage, Jump, JumpHead, MissionPhase
+from protocol.wire import MAX_MESSAGE_BYTES, encode
+
+PATIENCE_S = 20.0
+CLIENT = """
+import asyncio, sys
+from protocol import topics
+from protocol.bus import connect
+from protocol.messages import JumpHead
+
+async def main() -> None:
+    async with connect(sys.argv[1], "m") as bus:
+        bus.on(topics.PHASE, lambda phase: None)
+        bus.watch_lives()
+        bus.announce("drone/9")
+        print("there", flush=True)
+        await bus.until(lambda: False, float(sys.argv[2]))
+        for done in range(200):
+            bus.put(topics.HEAD, JumpHead(epoch=1, next_sequence=0, done=done, phase="flying"))
+
+asyncio.run(main())
+"""
+
+
+@pytest.fixture
+def endpoint() -> Iterator[str]:
+    with tempfile.TemporaryDirectory(dir=socket_folder_parent()) as folder:
+        yield socket_endpoint(Path(folder))
+
+
+@pytest.fixture
+async def ground(endpoint: str) -> AsyncIterator[Bus]:
+    """The router's bus, lossless as in lockstep."""
+    async with connect(endpoint, "m", router=True, lossless=True) as bus:
+        bus.watch_lives()
+        yield bus
+
+
+@pytest.fixture
+async def drone(endpoint: str, ground: Bus) -> AsyncIterator[Bus]:
+    assert ground
+    async with connect(endpoint, "m", lossless=True) as bus:
+        bus.watch_lives()
+        yield bus
+
+
+def head(done: int) -> JumpHead:
+    return JumpHead(epoch=1, next_sequence=0, done=done, phase="flying")
+
+
+async def there(bus: Bus, other: Bus, role: str = "drone/1") -> None:
+    """``other``, whose subscriptions are declared, is heard of by ``bus``: it hears what ``bus`` puts from now on."""
+    other.announce(role)
+    assert await bus.until(lambda: role in bus.alive, PATIENCE_S)
+
+
+def blocked_until(condition: Callable[[], bool]) -> None:
+    """Keep the event loop from running until ``condition`` holds: `Bus.until` would let it drain the queues."""
+    pause = threading.Event()
+    assert any(condition() or pause.wait(0.001) for _ in range(int(PATIENCE_S / 0.001)))
+
+
+async def test_what_one_puts_the_other_hears_in_order(ground: Bus, drone: Bus) -> None:
+    heard: list[int] = []
+    drone.on(topics.HEAD, lambda message: heard.append(message.done))
+    await there(ground, drone)
+
+    for done in range(200):
+        ground.put(topics.HEAD, head(done))
+
+    assert await drone.until(lambda: len(heard) == 200, PATIENCE_S)
+    assert heard == list(range(200))
+    assert not drone.statistics.dropped
+    assert not drone.statistics.refused
+
+
+async def test_several_handlers_share_a_key_and_each_hears_all(ground: Bus, drone: Bus) -> None:
+    one: list[int] = []
+    other: list[int] = []
+    drone.on(topics.HEAD, lambda message: one.append(message.done))
+    drone.on(topics.HEAD, lambda message: other.append(message.done))
+    await there(ground, drone)
+
+    ground.put(topics.HEAD, head(1))
+    ground.put(topics.HEAD, head(2))
+
+    assert await drone.until(lambda: len(other) == 2, PATIENCE_S)
+    assert one == other == [1, 2]
+
+
+async def test_each_drone_has_its_key_and_one_can_listen_to_all_or_to_one(ground: Bus, drone: Bus) -> None:
+    all_of_them: list[int] = []
+    second: list[int] = []
+    ground.on(topics.STATE, lambda state: all_of_them.append(state.drone))
+    ground.on(topics.STATE, lambda state: second.append(state.drone), drone=2)
+    await there(drone, ground, "ground")
+    for number in (1, 2, 3):
+        state = DroneState(
+            drone=number,
+            tick=0,
+            pose=(0.0, 0.0, 2.0, 0.0, 1.3),
+            velocity=(0.0, 0.0, 0.0, 0.0, 0.0),
+            battery=1.0,
+            mode="flying",
+            importance=1.0,
+            control=None,
+        )
+        drone.put(topics.STATE, state, number)
+
+    assert await ground.until(lambda: len(all_of_them) == 3 and bool(second), PATIENCE_S)
+    assert (all_of_them, second) == ([1, 2, 3], [2])
+
+
+async def test_a_process_does_not_hear_itself(ground: Bus, drone: Bus) -> None:
+    own: list[int] = []
+    others: list[int] = []
+    ground.on(topics.HEAD, lambda message: own.append(message.done))
+    drone.on(topics.HEAD, lambda message: others.append(message.done))
+    await there(ground, drone)
+    await there(drone, ground, "ground")
+
+    ground.put(topics.HEAD, head(1))
+    assert await drone.until(lambda: bool(others), PATIENCE_S)
+    drone.put(topics.HEAD, head(2))
+    assert await ground.until(lambda: bool(own), PATIENCE_S)
+
+    assert (own, others) == ([2], [1])
+
+
+async def test_missions_on_one_router_do_not_hear_each_other(endpoint: str, ground: Bus, drone: Bus) -> None:
+    ours: list[int] = []
+    theirs: list[int] = []
+    drone.on(topics.HEAD, lambda message: ours.append(message.done))
+    async with connect(endpoint, "n", lossless=True) as listener, connect(endpoint, "n", lossless=True) as other:
+        listener.on(topics.HEAD, lambda message: theirs.append(message.done))
+        other.watch_lives()
+        await there(other, listener)
+        await there(ground, drone)
+
+        other.put(topics.HEAD, head(1))
+        assert await listener.until(lambda: bool(theirs), PATIENCE_S)
+        ground.put(topics.HEAD, head(2))
+        assert await drone.until(lambda: bool(ours), PATIENCE_S)
+
+    assert (ours, theirs) == ([2], [1])
+
+
+async def test_a_reader_that_is_too_slow_loses_the_oldest_and_they_are_counted(ground: Bus, drone: Bus) -> None:
+    room, sent = topics.PHASE.queue, 100
+    heard: list[str] = []
+    drone.on(topics.PHASE, lambda message: heard.append(message.reason))
+    await there(ground, drone)
+    key = topics.PHASE.of("*")
+
+    for number in range(sent):
+        ground.put(topics.PHASE, MissionPhase(phase="flying", reason=str(number)))
+    blocked_until(lambda: drone.statistics.dropped[key] == sent - room)
+
+    assert await drone.until(lambda: bool(heard), PATIENCE_S)
+    assert heard == [str(number) for number in range(sent - room, sent)]
+    assert drone.statistics.dropped == {key: sent - room}
+
+
+async def test_bytes_that_are_no_message_are_counted_and_later_ones_still_heard(ground: Bus, drone: Bus) -> None:
+    heard: list[int] = []
+    drone.on(topics.HEAD, lambda message: heard.append(message.done))
+    await there(ground, drone)
+
+    for payload in (b"", b"rubbish", encode(MissionPhase(phase="flying", reason="")), encode(head(1))[:-1]):
+        ground.put_encoded(topics.HEAD, payload)
+    ground.put(topics.HEAD, head(5))
+
+    assert await drone.until(lambda: bool(heard), PATIENCE_S)
+    assert heard == [5]
+    assert drone.statistics.refused == {topics.HEAD.key: 4}
+
+
+async def test_any_thread_may_put(ground: Bus, drone: Bus) -> None:
+    heard: list[int] = []
+    drone.on(topics.HEAD, lambda message: heard.append(message.done))
+    await there(ground, drone)
+
+    await asyncio.gather(*[asyncio.to_thread(ground.put, topics.HEAD, head(done)) for done in range(20)])
+
+    assert await drone.until(lambda: len(heard) == 20, PATIENCE_S)
+    assert sorted(heard) == list(range(20))
+
+
+async def test_waiting_ends_by_the_condition_by_a_recheck_or_by_the_time_out(ground: Bus) -> None:
+    done: list[int] = []
+    assert await ground.until(lambda: True, 0.0)
+    assert not await ground.until(lambda: bool(done), 0.01)
+
+    waiting = asyncio.create_task(ground.until(lambda: bool(done), PATIENCE_S))
+    await asyncio.sleep(0)
+    done.append(1)
+    assert not waiting.done()
+    ground.recheck()
+    async with asyncio.timeout(PATIENCE_S / 2):
+        assert await waiting
+
+
+async def test_a_life_appears_and_ends_with_its_process(endpoint: str, ground: Bus) -> None:
+    ground.announce("ground")
+    async with connect(endpoint, "m") as late:
+        late.watch_lives()
+        assert await late.until(lambda: "ground" in late.alive, PATIENCE_S), "also those who were there before"
+        late.announce("drone/4")
+        assert await ground.until(lambda: "drone/4" in ground.alive, PATIENCE_S)
+    assert await ground.until(lambda: "drone/4" not in ground.alive, PATIENCE_S)
+
+
+async def test_a_process_that_is_killed_is_missed(endpoint: str, ground: Bus) -> None:
+    process = subprocess.Popen([sys.executable, "-c", CLIENT, endpoint, "60"], cwd=ROOT)  # noqa: ASYNC220
+    try:
+        assert await ground.until(lambda: "drone/9" in ground.alive, PATIENCE_S)
+        process.send_signal(signal.SIGKILL)
+        assert await ground.until(lambda: "drone/9" not in ground.alive, PATIENCE_S)
+    finally:
+        process.kill()
+        process.wait()
+
+
+async def test_a_process_that_talks_to_the_last_moment_ends_by_itself(endpoint: str, ground: Bus) -> None:
+    heard: list[int] = []
+    ground.on(topics.HEAD, lambda message: heard.append(message.done))
+    ended = await asyncio.to_thread(
+        subprocess.run,
+        [sys.executable, "-c", CLIENT, endpoint, "0"],
+        cwd=ROOT,
+        check=False,
+        capture_output=True,
+        timeout=PATIENCE_S,
+        env=os.environ | {"PYTHONWARNINGS": "error"},
+    )
+
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, b"there\n", b"")
+    assert await ground.until(lambda: bool(heard) and heard[-1] == 199, PATIENCE_S)
+
+
+async def test_a_process_ends_by_itself_after_its_router_is_gone(endpoint: str) -> None:
+    async with connect(endpoint, "m", router=True) as router:
+        router.watch_lives()
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", CLIENT, endpoint, "1", cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        )
+        assert await router.until(lambda: "drone/9" in router.alive, PATIENCE_S)
+
+    async with asyncio.timeout(PATIENCE_S):
+        output, errors = await process.communicate()
+    assert (process.returncode, output, errors) == (0, b"there\n", b"")
+
+
+async def test_a_question_is_answered_in_the_loop_with_its_parameters(ground: Bus, drone: Bus) -> None:
+    asked: list[tuple[dict[str, str], str]] = []
+    jump = encode(Jump(epoch=7, sequence=3, tick=9, increments=np.ones(4, np.float32)))
+
+    def answer(parameters: dict[str, str]) -> JournalPage:
+        asked.append((parameters, threading.current_thread().name))
+        return JournalPage(epoch=7, next_sequence=4, jumps=(jump,))
+
+    ground.serve(topics.JOURNAL, answer)
+    await there(drone, ground, "ground")
+
+    page = await drone.ask(topics.JOURNAL, "from=3;to=4")
+
+    assert page == JournalPage(epoch=7, next_sequence=4, jumps=(jump,))
+    assert asked == [({"from": "3", "to": "4"}, threading.main_thread().name)]
+
+
+async def test_a_question_that_nobody_answers_is_an_error(drone: Bus) -> None:
+    async with asyncio.timeout(PATIENCE_S):
+        with pytest.raises(NoReply, match=r"phi/journal\?from=0;to=1: no valid answer"):
+            await drone.ask(topics.JOURNAL, "from=0;to=1")
+
+
+async def test_an_answer_that_is_too_long_to_send_is_no_answer_and_the_next_one_is(ground: Bus, drone: Bus) -> None:
+    def answer(parameters: dict[str, str]) -> JournalPage:
+        jumps = (bytes(MAX_MESSAGE_BYTES),) if parameters["from"] == "0" else ()
+        return JournalPage(epoch=7, next_sequence=0, jumps=jumps)
+
+    ground.serve(topics.JOURNAL, answer)
+    await there(drone, ground, "ground")
+
+    async with asyncio.timeout(PATIENCE_S):
+        with pytest.raises(NoReply):
+            await drone.ask(topics.JOURNAL, "from=0")
+        assert (await drone.ask(topics.JOURNAL, "from=1")).epoch == 7
+
+
+def test_parameters_are_read_as_far_as_they_make_sense() -> None:
+    assert parse_parameters("from=3;to=9") == {"from": "3", "to": "9"}
+    assert parse_parameters("") == {}
+    assert parse_parameters("from=;=4;flag") == {"from": "", "flag": ""}
+
+
+async def test_an_endpoint_that_is_taken_is_an_error_and_its_owner_goes_on(endpoint: str, ground: Bus) -> None:
+    with pytest.raises(BusError, match=f"cannot listen at {endpoint}"):
+        async with connect(endpoint, "m", router=True):
+            pass
+
+    heard: list[int] = []
+    ground.on(topics.HEAD, lambda message: heard.append(message.done))
+    ground.announce("ground")
+    async with connect(endpoint, "m") as client:
+        client.watch_lives()
+        assert await client.until(lambda: "ground" in client.alive, PATIENCE_S)
+        client.put(topics.HEAD, head(1))
+        assert await ground.until(lambda: heard == [1], PATIENCE_S)
+
+
+async def test_an_endpoint_is_free_again_after_its_owner_closed(endpoint: str) -> None:
+    for _ in range(2):
+        async with connect(endpoint, "m", router=True):
+            pass
+
+
+async def test_a_router_that_is_not_there_is_an_error_after_the_time_out(endpoint: str) -> None:
+    async with asyncio.timeout(PATIENCE_S):
+        with pytest.raises(BusError, match=f"cannot reach {endpoint}"):
+            async with connect(endpoint, "m", timeout_s=0.1):
+                pass
+
+
+async def test_a_client_waits_for_a_router_that_comes_later(endpoint: str) -> None:
+    async def fetch_life() -> bool:
+        async with connect(endpoint, "m", timeout_s=PATIENCE_S) as early:
+            early.watch_lives()
+            return await early.until(lambda: "ground" in early.alive, PATIENCE_S)
+
+    waiting = asyncio.create_task(fetch_life())
+    await asyncio.sleep(0)
+    async with connect(endpoint, "m", router=True) as router:
+        router.announce("ground")
+        assert await waiting
+
+
+@pytest.mark.parametrize("malformed", ["", "rubbish", "unixsock-stream/"])
+@pytest.mark.parametrize("router", [True, False])
+async def test_a_malformed_endpoint_is_an_error_at_once(malformed: str, router: bool) -> None:
+    async with asyncio.timeout(PATIENCE_S):
+        with pytest.raises(BusError, match=f"{malformed or 'an empty endpoint'}: Endpoints must be of the form"):
+            async with connect(malformed, "m", router=router, timeout_s=10 * PATIENCE_S):
+                pass
+
+
+async def test_a_closed_bus_refuses_everything_with_its_own_error(endpoint: str) -> None:
+    async with connect(endpoint, "m", router=True) as bus:
+        bus.put(topics.HEAD, head(1))
+    for act in (
+        lambda: bus.put(topics.HEAD, head(2)),
+        lambda: bus.put(topics.PHASE, MissionPhase(phase="flying", reason="")),
+        lambda: bus.on(topics.HEAD, print),
+        lambda: bus.announce("ground"),
+        bus.watch_lives,
+        lambda: bus.serve(topics.JOURNAL, lambda _: JournalPage(epoch=1, next_sequence=0, jumps=())),
+    ):
+        with pytest.raises(BusError, match="session closed"):
+            act()
+    with pytest.raises(BusError, match="session closed"):
+        await bus.ask(topics.JOURNAL, "")
