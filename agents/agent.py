@@ -1,7 +1,7 @@
 """One drone's process: reads its vehicle, keeps its replica of phi, decides, flies, and says what it did.
 
 The shell around the pure parts. Per tick: state out, the team's states in, phi advanced to the agreed tick, the
-planner's decision, setpoint out (DESIGN.md, "Agent, per tick").
+planner's decision, setpoint out (ARCHITECTURE.md, "One tick").
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from agents.watchdog import Watchdog
 from protocol import topics
 from protocol.bus import Bus, connect
 from protocol.clock import SimulatorClock
-from protocol.errors import NoReply, ProcessError
+from protocol.errors import MessageError, NoReply, ProcessError
 from protocol.field import VirtualField
 from protocol.geometry import Floats
 from protocol.importance import ImportanceField, compile_kernels
@@ -79,7 +79,7 @@ class Agent:
                     if tick is not None:
                         had_simulator = True
                         await self._step(tick)
-                    elif had_simulator and not self._finished and "sim" not in self._bus.alive:
+                    elif had_simulator and "sim" not in self._bus.alive and not self._finished:
                         raise ProcessError(f"drone {self._drone}: the simulator is gone")
             finally:
                 self._vehicle.stop()
@@ -157,9 +157,12 @@ class Agent:
         except NoReply as error:
             log.warning("jumps %d to %d are missing: %s", first, last, error)
             return
-        for encoded in page.jumps:
-            self._replica.hear(decode(Jump, encoded))
-        log.info("fetched jumps %d to %d", first, last)
+        try:
+            for encoded in page.jumps:
+                self._replica.hear(decode(Jump, encoded))
+        except MessageError as error:
+            log.warning("a jump of the journal cannot be read: %s", error)
+        log.info("fetched jumps from %d on, next is %d", first, self._replica.next_sequence)
 
     def _state_of(self, telemetry: Telemetry, tick: int) -> DroneState:
         braking = self._control is not None and self._control.outcome != "solved"

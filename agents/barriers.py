@@ -4,7 +4,7 @@ The paper's barriers assume that a drone flies the commanded velocity at once. A
 ``tau dv/dt = u - v``. Then ``y = p + tau v`` moves exactly as commanded, ``dy/dt = u``, so every barrier is built on
 the *predicted* pose y, and p, a moving average of past y, stays where y stayed: inside the box exactly, and outside
 the separation ball when the ball is widened as `widened_separation` says. With the rows held, y never leaves the safe
-set, also when u is constant over a tick of length h <= 1/a: b falls at most by a h b.
+set, also when u is constant over a tick of length h <= 1/(2a): b falls at most by 2 a h b.
 """
 
 from __future__ import annotations
@@ -102,11 +102,11 @@ class Barriers:
     def rows(self, predicted: Floats, neighbours: Sequence[Neighbour]) -> Rows:
         """All strict rows at the predicted pose (5,).
 
-        pitch: b = ((max - min) / 2)^2 - (pitch - mid)^2; as printed it allows twice the range (PAPER.md, error 2).
+        pitch: b = ((max - min) / 2)^2 - (pitch - mid)^2 (ARCHITECTURE.md, departure 2).
         region: b = distance inside each of the six faces.
-        separation:<id>: one per neighbour (PAPER.md, error 7), b = |dy|^2 - D^2, and each of the two drones may use
-        half of the closing speed that keeps b from becoming negative. A neighbour that has been silent for ``age``
-        keeps its place, and D grows by ``age`` times its top speed.
+        separation:<id>: one per neighbour (departure 7), b = |dy|^2 - D^2. Each drone's own velocity may shrink b by
+        gain b; two that approach each other shrink it by twice that, and it still never becomes negative. A neighbour
+        that has been silent for ``age`` keeps its place, and D grows by ``age`` times its top speed.
         """
         positions = np.array([neighbour.position for neighbour in neighbours]).reshape(-1, 3)
         distances = np.array([self._wide + neighbour.age_s * self._top_speed for neighbour in neighbours])

@@ -38,8 +38,11 @@ Measured over flights of two and four drones: without it the velocities that met
 the shortest; with it they are within 1 %, and w is off by 1e-4 of xi2."""
 CHECK_EVERY = 5
 """Iterations between two tests of convergence; a warm start often needs no more."""
-MAX_ITERATIONS = 4000
-"""About a millisecond. A bound in iterations, not in seconds, gives the same answer on a busy machine."""
+ADAPT_EVERY = 200
+"""Iterations between two changes of the solver's step size. Measured over 15,000 programs of flights and at random: at
+50 or 100 some cycled for ever, at 200 all were solved, in 80 iterations at the mean and 3430 at most."""
+MAX_ITERATIONS = 10_000
+"""A few milliseconds. A bound in iterations, not in seconds, gives the same answer on a busy machine."""
 
 _INFINITY = 1e30  # what the solver takes for no bound
 _VARIABLES, _INPUTS = 6, 5
@@ -84,7 +87,7 @@ def _fill(
     ``quadratic`` and ``linear`` (6,), ``lower`` and ``upper`` (rows,), and the columns of the constraint ``matrix``
     one after another: five with sampling, own bound and all strict rows, and the slack's with its single entry.
     """
-    reach = max(1e-3, 0.5 * np.abs(xi1).sum())
+    reach = max(1e-3, (np.abs(xi1) * np.maximum(-low, high)).sum())
     cost = reach * max(abs(xi2), reach)
     quadratic[:_INPUTS] = max(2 * effort / cost, EFFORT_FLOOR)
     quadratic[_INPUTS] = 2 * reach * reach / cost
@@ -147,6 +150,7 @@ class QuadraticProgram:
             eps_rel=0.0,
             max_iter=MAX_ITERATIONS,
             check_termination=CHECK_EVERY,
+            adaptive_rho_interval=ADAPT_EVERY,
             polishing=False,
         )
 

@@ -1,4 +1,4 @@
-"""Stops the vehicle when the control task falls silent (safety rule 2).
+"""Stops the vehicle when the control task falls silent, whatever the reason.
 
 It runs in a thread of its own, because what it guards against is an event loop that is blocked or a task that died;
 an autopilot's own time-out does not help where its link layer keeps repeating the last setpoint.

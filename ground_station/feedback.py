@@ -24,6 +24,10 @@ class FeedbackSchedule:
         """When a jump from the map of ``tick`` is applied, in every process."""
         return tick + self._delay
 
+    def settled_after(self, tick: int) -> int:
+        """The last tick that no map update of a tick after ``tick`` can change any more."""
+        return self.effective_tick((tick // self._period + 1) * self._period) - 1
+
     def increments(self, change: NDArray[np.float32], importance: float) -> NDArray[np.float32] | None:
         """delta_2 h2 per position; None while J >= J_th, without gain, or when nothing changed.
 

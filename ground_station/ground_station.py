@@ -25,6 +25,7 @@ from ground_station.status import StatusBoard
 from protocol import topics
 from protocol.bus import Bus, connect
 from protocol.clock import SimulatorClock
+from protocol.errors import MessageError
 from protocol.field import VirtualField
 from protocol.importance import ImportanceField, compile_kernels
 from protocol.messages import DroneState, JournalPage, Jump, JumpHead, Keyframe, MissionPhase, Phase, Tick
@@ -40,10 +41,14 @@ REAL_TIME_PATIENCE_S = 0.02
 IDLE_TIMEOUT_S = 1.0
 METRICS_PERIOD_S = 1.0
 """Mission time between two rows of metrics.csv."""
+CHECKPOINT_PERIOD_S = 60.0
+"""Mission time between two writings of the trajectories, which take some tens of milliseconds."""
 SCORE_PERIOD_S = 10.0
 """Mission time between two live F-scores."""
 STATUS_PERIOD_S = 0.5
 """Wall time between two status messages."""
+LEAD_TICKS, HEAD_EVERY_TICKS = 8, 4
+"""How far ahead of this process the simulator may fly in lockstep, and how often it is told."""
 JUMP_LEAD_TICKS = 4
 """In real time, a jump that came too late for its tick takes effect so many ticks after now: time to travel."""
 KEYFRAME_BACKLOG = 200
@@ -82,6 +87,7 @@ class GroundStation:
         self._phase: Phase = "starting"
         self._reason = ""
         self._tick = 0
+        self._promised = 0
         bus.on(topics.STATE, self._hear_state)
         bus.on(topics.KEYFRAME, self._hear_keyframe)
         bus.serve(topics.JOURNAL, self._answer)
@@ -98,7 +104,10 @@ class GroundStation:
         self._received.append(keyframe)
 
     def _answer(self, parameters: dict[str, str]) -> JournalPage:
-        first, last = int(parameters.get("from", 0)), int(parameters.get("to", self._journal.next_sequence))
+        try:
+            first, last = int(parameters.get("from", 0)), int(parameters.get("to", self._journal.next_sequence))
+        except ValueError as error:
+            raise MessageError(f"journal: from and to must be numbers: {parameters}") from error
         return JournalPage(
             epoch=self._journal.epoch,
             next_sequence=self._journal.next_sequence,
@@ -128,7 +137,7 @@ class GroundStation:
                 self._phase = "flying"
                 await self._step(tick)
                 self._reason = self._end_of(tick)
-                self._publish_head(tick.tick + 1)
+                self._publish_head(tick.tick)
             elif self._phase == "flying" and "sim" not in self._bus.alive:
                 self._reason = "the simulator is gone"
 
@@ -199,11 +208,14 @@ class GroundStation:
         )
 
     async def _settle_updates(self, tick: Tick) -> None:
-        """Turn finished updates into jumps; in lockstep, wait for one that takes effect at this tick's end."""
+        """Turn finished updates into jumps.
+
+        In lockstep exactly when one is about to take effect, and then it is waited for: what is recorded does not
+        depend on how fast the machine was.
+        """
         while self._updates:
             update = self._updates[0]
-            due = self._lockstep and update.effective <= tick.tick + 1
-            if not (update.task.done() or due):
+            if not (update.effective <= tick.tick + 1 if self._lockstep else update.task.done()):
                 return
             result = await update.task
             self._updates.popleft()
@@ -240,6 +252,8 @@ class GroundStation:
         self._board.note_poses(poses)
         if tick.tick % max(1, round(METRICS_PERIOD_S / self._mission.tick_s)) == 0:
             self._run.record_metrics(self._metrics())
+        if tick.tick % max(1, round(CHECKPOINT_PERIOD_S / self._mission.tick_s)) == 0:
+            self._run.checkpoint()
 
     def _metrics(self) -> Metrics:
         return Metrics(
@@ -251,12 +265,22 @@ class GroundStation:
             keyframes=self._keyframes,
         )
 
-    def _publish_head(self, done: int) -> None:
+    def _publish_head(self, tick: int) -> None:
+        """Say how far the simulator may go: not past a jump that is not out yet, nor far ahead of this process."""
+        done = min(self._schedule.settled_after(tick), tick + LEAD_TICKS)
+        if self._updates:
+            done = min(done, self._updates[0].effective - 1)
+        done = max(done, tick + 1)
+        finished = bool(self._reason)
+        awaited = self._promised <= tick + 1  # the simulator has used up what it was promised
+        if not (finished or awaited or done - self._promised >= HEAD_EVERY_TICKS):
+            return
+        self._promised = done
         head = JumpHead(
             epoch=self._journal.epoch,
             next_sequence=self._journal.next_sequence,
             done=done,
-            phase="finished" if self._reason else self._phase,
+            phase="finished" if finished else self._phase,
         )
         self._bus.put(topics.HEAD, head)
 
@@ -286,7 +310,7 @@ class GroundStation:
     async def _finish(self) -> None:
         """Stop the drones, complete the map, and leave the results in the run folder."""
         self._phase = "finished"
-        self._publish_head(self._tick + 1)
+        self._publish_head(self._tick)
         self._publish_phase()
         log.info("mission finished: %s", self._reason)
         loop = asyncio.get_running_loop()

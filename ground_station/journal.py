@@ -1,4 +1,4 @@
-"""Write-ahead journal of the jumps: on disk before anybody hears of them (safety rule 5).
+"""Write-ahead journal of the jumps: on disk before anybody hears of them.
 
 The file is a header with the epoch, then for each jump its length, two checksums and its bytes. A record that a crash
 tore can only be the last; nobody can have heard of it, so it is cut off when the journal is opened again. Any other

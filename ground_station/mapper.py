@@ -1,4 +1,4 @@
-"""The slow half of the ground station: images in, map out. One worker thread owns it, so that the event loop is free."""
+"""The slow half of the ground station: images in, map out. One worker thread owns it, and the event loop is free."""
 
 from __future__ import annotations
 

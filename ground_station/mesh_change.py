@@ -74,7 +74,7 @@ class GridMeshChange:
     are ordered with x slowest: index = (ix * ny + iy) * nz + iz.
 
     The paper does not state the grid's spacing, and its sum is not normalised, so one update could raise the
-    importance by far more than 1 (PAPER.md, error in print 6). ``feedback.normalisation`` "sum" is as printed;
+    importance by far more than 1 (ARCHITECTURE.md, departure 6). ``feedback.normalisation`` "sum" is as printed;
     "mean" divides by the sum of the kernel's weights at that position, so h2 stays within [0, 1].
     """
 

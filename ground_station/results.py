@@ -118,8 +118,7 @@ class Summary:
 class RunFolder:
     """Writer of a run's folder; one process has it open.
 
-    A folder that already holds this mission is continued: its rows and trajectories up to the last checkpoint are
-    kept, so a restarted ground station goes on. Raises MissionError if the folder holds another mission.
+    Raises MissionError if the folder holds another mission, or a flight: nothing that was recorded is written over.
     """
 
     def __init__(self, path: Path, mission: Mission) -> None:
@@ -139,14 +138,13 @@ class RunFolder:
 
         path.mkdir(parents=True, exist_ok=True)
         self._keep_mission()
-        self._resume()
         file = path / METRICS_FILE
-        fresh = not file.exists() or not file.stat().st_size
+        if file.exists():
+            raise MissionError([f"{file}: this folder holds a flight already; take a new one"])
         # Line buffered: each row reaches the operating system in one write, whatever then happens to this process.
-        self._rows = file.open("a", buffering=1, encoding="utf-8", newline="")
+        self._rows = file.open("x", buffering=1, encoding="utf-8", newline="")
         self._writer = csv.writer(self._rows, lineterminator="\n")
-        if fresh:
-            self._writer.writerow(_columns(self._drones))
+        self._writer.writerow(_columns(self._drones))
 
     def close(self) -> None:
         """Release the folder; may be repeated. What was recorded since the last checkpoint stays out of the npz."""
@@ -208,7 +206,7 @@ class RunFolder:
         _write_atomically(self.path / MESH_GLB_FILE, _glb(vertices, faces, colours))
 
     def checkpoint(self) -> None:
-        """Write trajectories and solver outcomes recorded so far; from here a restarted process goes on."""
+        """Write trajectories and solver outcomes recorded so far: what is left of them if the process is killed."""
         shape = (len(self._ticks), len(self._drones))
         content = io.BytesIO()
         np.savez_compressed(
@@ -254,19 +252,6 @@ class RunFolder:
         if path.exists() and path.read_bytes() != content:
             raise MissionError([f"{path}: this run folder belongs to another mission"])
         _write_atomically(path, content)
-
-    def _resume(self) -> None:
-        path = self.path / TRAJECTORIES_FILE
-        if not path.exists():
-            return
-        with np.load(path) as flown:
-            columns = [flown[name] for name in ("poses", "solve_time_s", "slack", "fallback")]
-            moments = zip(flown["tick"].tolist(), flown["time_s"].tolist(), strict=True)
-        for (tick, time_s), *rows in zip(moments, *columns, strict=True):
-            poses, solve_times, slacks, fallbacks = (dict(zip(self._drones, row.tolist(), strict=True)) for row in rows)
-            heard = {drone: pose for drone, pose in poses.items() if not math.isnan(pose[0])}
-            self.record_tick(tick, time_s, heard, solve_times, slacks, fallbacks)
-        self._separations = dict.fromkeys(self._drones, math.inf)
 
 
 def versions() -> dict[str, str]:

@@ -2,8 +2,7 @@
 
 zenoh calls back on its own threads. Here they only hand over: a sample goes into its subscription's bounded queue,
 and the event loop is woken once for a whole burst. Handlers then run in the loop, in order, and `Bus.until`
-re-checks what is being waited for. Lost, late and refused messages are counted, never guessed at
-(notes/zenoh.md, sections 0, 1 and 9, say why each setting is as it is).
+re-checks what is being waited for. Lost, late and refused messages are counted, never guessed at.
 """
 
 from __future__ import annotations

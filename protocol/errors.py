@@ -7,7 +7,6 @@
     |   `-- VersionError    ... because they speak another major version
     |-- BusError            the transport could not be opened, or is closed
     |   `-- NoReply         a query that nobody answered in time
-    |-- VehicleError        a vehicle that cannot be reached or refuses a command
     |-- JournalError        a journal that cannot be written or read back
     |-- ReconstructionError input that the reconstructor cannot work with
     `-- ProcessError        a process of the run that failed
@@ -50,10 +49,6 @@ class BusError(CovreconError):
 
 
 class NoReply(BusError):
-    pass
-
-
-class VehicleError(CovreconError):
     pass
 
 

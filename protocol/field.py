@@ -16,7 +16,7 @@ from protocol.mission import Target
 
 
 def _cell_centres(low: float, high: float, wished: float) -> Floats:
-    """Centres of the equal cells whose edge is nearest to ``wished`` (PAPER.md, error 4: both sizes come out)."""
+    """Centres of the equal cells whose edge is nearest to ``wished``; see ARCHITECTURE.md, departure 4."""
     count = max(1, round((high - low) / wished))
     edge = (high - low) / count
     return low + edge * (np.arange(count, dtype=np.float64) + 0.5)

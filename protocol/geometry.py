@@ -2,7 +2,7 @@
 
 World frame: right-handed, z up, metres. A drone's pose is ``p = [x, y, z, yaw, pitch]`` in metres and
 radians; *pitch is the depression angle*: 0 looks at the horizon, pi/2 straight down (Coverage-Recon,
-notation of eq. (1), with the sign that PAPER.md's list of errors in print, item 3, explains).
+notation of eq. (1), with the sign that departure 3 in ARCHITECTURE.md explains).
 Camera frame (OpenCV): x right, y down, z forward. Pixel (column, row) covers the square
 ``[column, column + 1) x [row, row + 1)``, so its centre lies at ``(column + 0.5, row + 0.5)``.
 """

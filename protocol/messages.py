@@ -42,7 +42,7 @@ class Tick(Message):
     vehicles: tuple[VehicleSample, ...]
     jump_epoch: Count
     next_jump: Count
-    """Jumps with a smaller sequence number take effect before this tick is integrated."""
+    """Jumps with a smaller sequence number are out; each takes effect at its own tick."""
     keyframes: Count
     """Keyframes sent before this tick."""
 
@@ -90,7 +90,7 @@ class DroneState(Message):
     pose: Vector5
     velocity: Vector5
     battery: Annotated[float, Field(ge=0, le=1)]
-    mode: Literal["waiting", "flying", "braking", "finished"]
+    mode: Literal["flying", "braking"]
     importance: Finite
     """J of this replica before the tick is integrated."""
     control: Control | None

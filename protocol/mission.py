@@ -1,7 +1,8 @@
 """What is to be flown: the one place where every setting, its unit, its default and the default's source live.
 
 A mission is written as TOML (`protocol.mission_file`). Keys carry their unit; "paper" means
-section "Parameters of the paper's simulation" in PAPER.md, eq. numbers are Coverage-Recon's.
+the simulation section of "Coverage-Recon: Coordinated Multi-Drone Image Sampling with Online Map Feedback", eq. numbers
+are that paper's, and departures from it are listed in ARCHITECTURE.md.
 """
 
 from __future__ import annotations
@@ -73,7 +74,7 @@ class Sensing(Settings):
     sigma_axis: Positive = 0.07
     """sigma_1: tolerance of 1 - cos(angle between optical axis and line of sight)."""
     sigma_view: Positive = 0.095
-    """sigma_2: tolerance of 1 - cos(angle between wished and actual view direction). PAPER.md, error 5."""
+    """sigma_2: tolerance of 1 - cos(angle between wished and actual view direction). Departure 5."""
     sigma_distance_m: Positive = 0.3
     """sigma_3: tolerance of the distance."""
     decay_per_s: Positive = 3.0
@@ -83,7 +84,7 @@ class Sensing(Settings):
 
 
 class Flight(Box):
-    """Where and how the drones may fly. The paper does not state input bounds; PAPER.md measured with these."""
+    """Where and how the drones may fly. The paper does not state input bounds; these are ours."""
 
     lower_m: Vector = (-4.0, -4.0, 0.5)
     upper_m: Vector = (4.0, 4.0, 5.0)
@@ -108,6 +109,18 @@ class Flight(Box):
         low, high = self.pitch_limits_rad
         if not -math.pi / 2 <= low < high <= math.pi / 2:
             raise ValueError(f"pitch_limits_rad must ascend within [-pi/2, pi/2], got [{low}, {high}]")
+        return self
+
+    @model_validator(mode="after")
+    def _can_brake_at_once(self) -> Self:
+        """Otherwise a drone could not command zero velocity without leaving the model its barriers rest on."""
+        for acceleration, speed in (
+            ("acceleration_max_mps2", "speed_max_mps"),
+            ("angular_acceleration_max_radps2", "turn_rate_max_radps"),
+        ):
+            reach = getattr(self, acceleration) * self.response_time_s
+            if 0 < reach < getattr(self, speed):
+                raise ValueError(f"{acceleration} x response_time_s, {reach:g}, must be at least {speed}")
         return self
 
 
@@ -146,7 +159,7 @@ class Feedback(Settings):
     kernel_m: Positive = 0.4
     """sigma_4."""
     spacing_m: Positive = 0.1
-    """Spacing of the evaluation points r_k; not stated in the paper (PAPER.md, error 6). At 0.3 m every point holds
+    """Spacing of the evaluation points r_k; not stated in the paper (departure 6). At 0.3 m every point holds
     some vertex that moved, and J hangs at its threshold; at 0.1 m jumps shrink as the map settles (docs/adr/0003)."""
     normalisation: Literal["sum", "mean"] = "mean"
     """"sum" as printed; "mean" divides by the kernel's weight, so that one jump never exceeds the gain."""
@@ -174,7 +187,7 @@ class Camera(Settings):
 
 
 class Reconstruction(Settings):
-    """Images to mesh; numbers from notes/reconstruction.md, section 2."""
+    """Images to mesh; docs/adr/0004 has the measurements behind it."""
 
     backend: Literal["plane_sweep", "none"] = "plane_sweep"
     sweep_width_px: Annotated[int, Field(ge=32, le=1024)] = 128
@@ -192,7 +205,8 @@ class Reconstruction(Settings):
 
 class Simulation(Settings):
     scene: str = "living_room"
-    """A scene's name, or the path of a folder or glb/obj/ply file, relative to the mission file."""
+    """A built-in scene's name, or the path of a glb, gltf, obj, ply or stl file or of a folder that holds one, relative
+    to the mission file; empty for a flight without images."""
     image_noise: NonNegative = 2.0
     """Standard deviation of the camera's noise, in grey levels of 255."""
 

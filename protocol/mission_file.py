@@ -23,8 +23,6 @@ SIZE_MAX = 256 * 1024
 TEAM_MAX = 255
 """Drones; what ids allow."""
 
-_SCENE_SUFFIXES = (".glb", ".obj", ".ply")
-
 
 def load_mission(path: Path, *, drones: int | None = None, seed: int | None = None) -> Mission:
     """Read and check a mission: TOML, or JSON as `mission_to_json` writes it (``.json``).
@@ -101,8 +99,11 @@ def _parse(path: Path, source: str) -> tuple[dict[str, Any], dict[KeyPath, int]]
 def _resolve_scene(raw: dict[str, Any], folder: Path) -> None:
     table = raw.get("simulation")
     scene = table.get("scene") if isinstance(table, dict) else None
-    if isinstance(table, dict) and isinstance(scene, str) and ("/" in scene or scene.endswith(_SCENE_SUFFIXES)):
-        table["scene"] = str((folder / scene).resolve())
+    if not isinstance(table, dict) or not isinstance(scene, str) or not scene:
+        return
+    path = (folder / Path(scene).expanduser()).resolve()
+    if "/" in scene or path.suffix or path.exists():  # a built-in scene's name is a bare word
+        table["scene"] = str(path)
 
 
 def _complete_team(raw: dict[str, Any], drones: int | None) -> list[Fault]:

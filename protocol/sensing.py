@@ -4,8 +4,8 @@ h1 of eq. (1) is exp(-E) with ``E = (1 - c1)^2 / 2 s1^2 + (1 - c2)^2 / 2 s2^2 + 
 the last term depend on a cell's position alone, so a position where they exceed the cut is skipped with all
 its directions, and only the box around each drone's view cone is visited: cost does not grow with the field.
 
-Ownership (PAPER.md, error 1): a cell belongs to the drone with the *largest* h1; a tie goes to the lowest row
-of ``poses``, which callers order by drone id, so that every replica agrees.
+Ownership (ARCHITECTURE.md, departure 1): a cell belongs to the drone with the *largest* h1; a tie goes to the lowest
+row of ``poses``, which callers order by drone id, so that every replica agrees.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def _decay_position(
         after = values[j] * h[j]
         removed += np.float64(values[j]) - np.float64(after)
         phi[row, j] = after
-    return sum_h, sum_hh, sum_tc, tx, ty, tz, removed
+    return float(sum_h), float(sum_hh), float(sum_tc), float(tx), float(ty), float(tz), removed
 
 
 @njit(cache=True, nogil=True)
@@ -329,4 +329,5 @@ def owned_shares(
                 if exponent < best:
                     best, winner = exponent, k
             counts[winner] += 1.0
-    return counts / counts.sum()
+    shares: Floats = counts / counts.sum()
+    return shares

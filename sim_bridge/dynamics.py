@@ -34,14 +34,12 @@ class VehicleBody:
     def step(self, dt: float, now_s: float, flight: Flight) -> None:
         """Advance by ``dt`` seconds: ``dv/dt = clip((u - v) / tau, +-a)`` on each axis, exact while unclipped.
 
-        Setpoints older than the time-out are replaced by zero velocity, as an autopilot does (safety rule 2).
+        Setpoints older than the time-out are replaced by zero velocity, as an autopilot does.
         """
         if now_s - self.commanded_at_s > flight.setpoint_timeout_s:
             self.commanded = np.zeros(5)
         limits = (flight.acceleration_max_mps2, flight.angular_acceleration_max_radps2)
-        self.pose, self.velocity = _follow(
-            self.pose, self.velocity, self.commanded, limits, flight.response_time_s, dt
-        )
+        self.pose, self.velocity = _follow(self.pose, self.velocity, self.commanded, limits, flight.response_time_s, dt)
 
 
 @njit(cache=True, nogil=True)

@@ -45,20 +45,20 @@ class Photographer:
     def take(self, shot: Shot) -> Keyframe:
         """Render one; the noise depends on the mission's seed, the drone and the sequence number alone."""
         settings = self._mission.camera
-        image = self._camera.render(shot.pose)
+        image = self._camera.render(shot.pose.tolist())
         if self._mission.simulation.image_noise > 0:
             generator = np.random.default_rng([self._mission.seed, shot.drone, shot.sequence])
             image = add_noise(image, self._mission.simulation.image_noise, generator)
         jpeg = io.BytesIO()
         Image.fromarray(image).save(jpeg, "JPEG", quality=settings.jpeg_quality)
-        rotation = camera_rotation(shot.pose[3], shot.pose[4])
+        x_row, y_row, z_row = camera_rotation(shot.pose[3], shot.pose[4]).tolist()
         intrinsics = self._intrinsics
         return Keyframe(
             drone=shot.drone,
             sequence=shot.sequence,
             tick=shot.tick,
             position=tuple(shot.pose[:3].tolist()),
-            rotation=tuple(tuple(row) for row in rotation.tolist()),
+            rotation=(tuple(x_row), tuple(y_row), tuple(z_row)),
             width=intrinsics.width,
             height=intrinsics.height,
             fx=intrinsics.fx,

@@ -2,7 +2,7 @@
 
 Lockstep: tick k is published, keyframes are rendered while the agents think, and the world steps once every live
 agent has answered and the ground station is done up to tick k + 1. Real time: ticks follow the machine's clock and
-nobody is waited for. No check is different in simulation (safety rule 3).
+nobody is waited for. No check is different in simulation.
 """
 
 from __future__ import annotations

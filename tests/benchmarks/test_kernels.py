@@ -17,6 +17,7 @@ from protocol.importance import ImportanceField
 from protocol.mission import Drone, Mission, Sensing, Target
 from sim_bridge.dynamics import VehicleBody
 
+Record = Callable[..., None]
 DT = 0.05
 STARTS = ((0.0, 1.0, 2.0, 0.0, 1.3), (2.0, 1.0, 2.0, 1.0, 1.4), (-2.0, 1.0, 2.0, 2.0, 1.2), (0.0, -2.0, 2.0, 3.0, 1.3))
 
@@ -67,7 +68,7 @@ def dense_tick(phi: Floats, positions: Floats, directions: Floats, poses: Floats
     return gradient
 
 
-def test_field_tick(record) -> None:
+def test_field_tick(record: Record) -> None:
     """Decay of four drones and one drone's terms over 117,600 cells; the issue's bar is 100 times."""
     field, sensing, poses = VirtualField.of(Target()), Sensing(), np.array(STARTS)
     importance = ImportanceField(field, sensing)
@@ -80,7 +81,7 @@ def test_field_tick(record) -> None:
     record("field_tick_117600", windowed * 1e3, "ms CPU", "dense NumPy float64", dense / windowed)
 
 
-def test_qp_solve(record) -> None:
+def test_qp_solve(record: Record) -> None:
     """The QPs of a real flight: updated and warm-started against set up anew; the issue's bar is 20 times."""
     mission = Mission(drones=tuple(Drone(id=k + 1, start=start) for k, start in enumerate(STARTS)))
     problems = _problems_of_a_flight(mission, ticks=300)

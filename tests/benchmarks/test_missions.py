@@ -8,8 +8,10 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 
+Record = Callable[..., None]
 COVRECON = Path(sys.executable).with_name("covrecon")
 LIMIT_S = 900
 FLIGHT = """
@@ -71,13 +73,13 @@ def _sample_memory(folder: Path, memory: dict[str, int]) -> None:
             memory[module] = max(memory[module], pages * 4096 // 10**6)
 
 
-def test_lockstep_flight(record, tmp_path: Path) -> None:
+def test_lockstep_flight(record: Record, tmp_path: Path) -> None:
     speed, memory, _ = fly(FLIGHT, tmp_path)
     record("lockstep_flight_4", speed, "simulated s / wall s", "real time", speed)
     record("memory_agent", memory["agents"], "MB", f"limit of {AGENT_MB} MB", AGENT_MB / memory["agents"])
 
 
-def test_lockstep_full(record, tmp_path: Path) -> None:
+def test_lockstep_full(record: Record, tmp_path: Path) -> None:
     speed, memory, summary = fly(FULL, tmp_path)
     keyframes = float(str(summary["keyframes"])) / float(str(summary["sim_time_s"]))
     record("lockstep_full_4", speed, "simulated s / wall s", "real time", speed)

@@ -31,7 +31,7 @@ from protocol.bus import connect
 from protocol.messages import JumpHead
 
 async def main() -> None:
-    async with connect(sys.argv[1], "m") as bus:
+    async with connect(sys.argv[1], "m", lossless=True) as bus:
         bus.on(topics.PHASE, lambda phase: None)
         bus.watch_lives()
         bus.announce("drone/9")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 import pytest
@@ -15,7 +16,8 @@ from numba import njit
 from agents.barriers import Neighbour, predicted_pose
 from agents.coverage import CoverageController
 from protocol.field import VirtualField
-from protocol.importance import ImportanceField
+from protocol.geometry import Floats
+from protocol.importance import ImportanceField, SamplingTerms
 from protocol.mission import Drone, Flight, Mission
 from sim_bridge.dynamics import VehicleBody
 
@@ -87,9 +89,9 @@ class TeamFlight:
 def test_importance_falls_as_fast_as_measured_on_the_paper_s_equations(
     drones: int, half_s: float, quarter_s: float
 ) -> None:
-    """PAPER.md, "Measured on these equations": bounds +-0.5, no feedback; mean over four first headings.
+    """The reference times of the plain equations: bounds +-0.5, no feedback; mean over four first headings.
 
-    A single flight is chaotic, its times spread by 10 % with any detail of the start. PAPER.md says where the first
+    A single flight is chaotic, its times spread by 10 % with any detail of the start. The paper says where the first
     drone starts; the others stand in a row beside it.
     """
     halves, quarters = [], []
@@ -147,20 +149,32 @@ def test_drones_keep_their_separation_from_one_that_fell_silent(mission: Mission
     assert flight.min_separation >= mission.flight.separation_m
 
 
-def test_drones_that_are_driven_at_each_other_stay_apart() -> None:
-    """Worst case for the lag: all importance but that between the drones is gone, so they meet at full speed."""
+class Lure:
+    """Stands in for the field of a team of two: whatever either does, it wants to be where the other is."""
+
+    def advance(self, poses: np.ndarray, _dt: float, own: int) -> SamplingTerms:
+        towards = np.append(poses[1 - own, :3] - poses[own, :3], [0.0, 0.0])
+        return SamplingTerms(1e4 * towards, 0.0, 0.0)
+
+    def owned_cells(self, poses: np.ndarray) -> np.ndarray:
+        return np.full(len(poses), 1e7)
+
+
+@pytest.mark.parametrize("offset_m", [0.0, 0.1])
+def test_drones_that_are_driven_at_each_other_stay_apart(offset_m: float) -> None:
+    """Worst case for the lag: they meet at full speed, head-on or nearly so."""
     mission = Mission(
-        drones=(Drone(id=1, start=(-2.0, 0.0, 2.0, 0.0, 1.3)), Drone(id=2, start=(2.0, 0.1, 2.0, 0.0, 1.3)))
+        drones=(Drone(id=1, start=(-2.0, 0.0, 2.0, 0.0, 1.3)), Drone(id=2, start=(2.0, offset_m, 2.0, 0.0, 1.3)))
     )
     flight = TeamFlight(mission)
-    near_middle = np.abs(flight.replicas[0].field.positions()[:, :2]).max(axis=1) < 0.5
-    for replica in flight.replicas:
-        replica.phi[~near_middle] = 0.0
-        replica.phi[near_middle] = 50.0
+    flight.replicas = [cast("ImportanceField", Lure()), cast("ImportanceField", Lure())]
+    fastest = 0.0
     for _ in range(400):
         flight.step()
-    assert 1.0 <= flight.min_separation < 1.2
-    assert set(flight.outcomes) == {"solved"}
+        fastest = max(fastest, *(abs(body.velocity[0]) for body in flight.bodies))
+    assert fastest > 0.99 * mission.flight.speed_max_mps
+    assert 1.0 <= flight.min_separation < 1.1
+    assert flight.outcomes.count("solved") >= 0.95 * len(flight.outcomes), "rows nearly parallel are slow to solve"
 
 
 def test_every_replica_integrates_the_same_field() -> None:
@@ -173,7 +187,15 @@ def test_every_replica_integrates_the_same_field() -> None:
 
 
 @njit(cache=True)
-def dense_decay(phi, positions, directions, pose, sigmas, distance, rate) -> None:
+def dense_decay(
+    phi: Floats,
+    positions: Floats,
+    directions: Floats,
+    pose: Floats,
+    sigmas: tuple[float, float, float],
+    distance: float,
+    rate: float,
+) -> None:
     """Eqs. (1) and (2) for one drone over every cell in float64; past e^-45 a factor is 1 to the last bit."""
     axis = (np.cos(pose[3]) * np.cos(pose[4]), np.sin(pose[3]) * np.cos(pose[4]), -np.sin(pose[4]))
     for i in range(positions.shape[0]):

@@ -48,6 +48,12 @@ poses = st.tuples(
 ).map(np.array)
 
 
+def strong(speed: float, response: float) -> dict[str, float]:
+    """Accelerations that a mission may have at this speed and lag, with nothing to spare."""
+    least = 1.001 * max(speed, 0.5) / (response or 1.0)
+    return {"acceleration_max_mps2": least, "angular_acceleration_max_radps2": least}
+
+
 def separation(neighbour: Neighbour) -> Callable[[Floats], float]:
     distance = widened_separation(FLIGHT) + top_speed(FLIGHT) * neighbour.age_s
     return lambda pose: math.dist(pose[:3], neighbour.position) ** 2 - distance**2
@@ -117,7 +123,7 @@ def test_beyond_a_pitch_limit_the_gimbal_must_turn_back() -> None:
 @given(separation_m=st.floats(0.1, 5), speed=st.floats(0.01, 20), response=st.just(0.0) | st.floats(0.001, 3))
 def test_the_widened_separation_is_the_root_of_its_equation(separation_m: float, speed: float, response: float) -> None:
     """Also for a vehicle so fast or slow to respond that it travels many separations within its lag."""
-    flight = Flight(separation_m=separation_m, speed_max_mps=speed, response_time_s=response)
+    flight = Flight(separation_m=separation_m, speed_max_mps=speed, response_time_s=response, **strong(speed, response))
 
     wide = widened_separation(flight)
 
@@ -204,7 +210,8 @@ speeds = st.tuples(*[st.floats(-0.7, 0.7)] * 5).map(np.array)
 @reproducible
 @given(velocity=speeds, response=st.sampled_from([0.0, 0.05, 0.15, 1.0]))
 def test_braking_is_always_within_the_velocity_bounds(velocity: Floats, response: float) -> None:
-    low, high = Barriers(mission(Flight(response_time_s=response))).velocity_bounds(velocity)
+    flight = Flight(response_time_s=response, **strong(0.5, response))
+    low, high = Barriers(mission(flight)).velocity_bounds(velocity)
 
     assert (low <= 0).all()
     assert (high >= 0).all()
@@ -213,8 +220,8 @@ def test_braking_is_always_within_the_velocity_bounds(velocity: Floats, response
 @reproducible
 @given(velocity=speeds)
 def test_velocity_bounds_keep_within_the_input_box_and_the_acceleration(velocity: Floats) -> None:
-    flight = Flight(response_time_s=0.05, acceleration_max_mps2=3.0, angular_acceleration_max_radps2=2.0)
-    change = 0.05 * np.array([3, 3, 3, 2, 2])
+    flight = Flight(response_time_s=0.05, acceleration_max_mps2=10.0, angular_acceleration_max_radps2=12.0)
+    change = 0.05 * np.array([10, 10, 10, 12, 12])
 
     low, high = Barriers(mission(flight)).velocity_bounds(velocity)
 

@@ -57,3 +57,12 @@ def test_a_period_shorter_than_a_tick_means_every_tick() -> None:
     eager = schedule(period_s=0.01, delay_s=0.0)
 
     assert [eager.is_due(tick) for tick in range(3)] == [False, True, True]
+
+
+@pytest.mark.parametrize(("period_s", "delay_s"), [(2.0, 1.0), (2.0, 2.0), (0.05, 0.0), (0.5, 0.3)])
+def test_a_tick_is_settled_exactly_when_no_later_map_can_change_it(period_s: float, delay_s: float) -> None:
+    timed = schedule(period_s=period_s, delay_s=delay_s)
+
+    for now in range(100):
+        later = min(timed.effective_tick(tick) for tick in range(now + 1, now + 100) if timed.is_due(tick))
+        assert timed.settled_after(now) == later - 1

@@ -81,6 +81,13 @@ def test_the_gimbal_s_limits_ascend_within_a_quarter_turn(limits: tuple[float, f
     assert "pitch_limits_rad must ascend within" in faults(changed(("flight", "pitch_limits_rad"), limits))
 
 
+@pytest.mark.parametrize("key", ["acceleration_max_mps2", "angular_acceleration_max_radps2"])
+def test_a_vehicle_can_brake_from_full_speed_within_its_own_model(key: str) -> None:
+    assert Mission.model_validate(changed(("flight", key), 0.5 / 0.15 + 1e-9))
+    assert f"{key} x response_time_s, 0.45, must be at least" in faults(changed(("flight", key), 3.0))
+    assert Mission.model_validate(changed(("flight", "response_time_s"), 0.0))
+
+
 def test_a_jump_takes_effect_before_the_next_mesh_is_compared() -> None:
     assert Feedback(delay_s=2.0, period_s=2.0).delay_s == 2.0
     with pytest.raises(ValidationError, match=r"delay_s 2\.5 must not exceed period_s 2"):

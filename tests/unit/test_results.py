@@ -148,22 +148,22 @@ def test_trajectories_and_solver_outcomes_are_read_back(folder: RunFolder) -> No
         assert flown["fallback"][4, 1] == "infeasible"
 
 
-def test_a_restarted_process_goes_on_from_the_checkpoint(folder: RunFolder) -> None:
+def test_a_checkpoint_holds_what_was_flown_until_then(folder: RunFolder) -> None:
+    fly(folder, 0, 6)
+    folder.checkpoint()
+    fly(folder, 6, 10)
+    with np.load(folder.path / "trajectories.npz") as flown:
+        assert flown["tick"].tolist() == list(range(6))
+
+
+def test_a_folder_that_holds_a_flight_is_refused_and_left_as_it_is(folder: RunFolder) -> None:
     fly(folder, 0, 6)
     folder.record_metrics(metrics(6))
-    folder.checkpoint()
     folder.close()
-    again = RunFolder(folder.path, MISSION)
-    fly(again, 6, 10)
-    again.record_metrics(metrics(10))
-    summary = finish(again)
-    again.close()
-    assert summary["min_separation_m"] == 2.91
-    assert summary["fallbacks"] == {"1": 0, "4": 3}
-    assert [row["tick"] for row in rows(folder.path / "metrics.csv")] == ["6", "10"]
-    with np.load(folder.path / "trajectories.npz") as flown:
-        assert flown["tick"].tolist() == list(range(10))
-        assert np.isnan(flown["poses"][7, 1]).all()
+    before = (folder.path / "metrics.csv").read_bytes()
+    with pytest.raises(MissionError, match=r"metrics\.csv: this folder holds a flight already"):
+        RunFolder(folder.path, MISSION)
+    assert (folder.path / "metrics.csv").read_bytes() == before
 
 
 def test_equal_runs_leave_equal_bytes(tmp_path: Path) -> None:

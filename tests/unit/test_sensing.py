@@ -1,10 +1,12 @@
 """The windowed kernel against the dense float64 formula, written here as the paper prints it."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from protocol.field import VirtualField
-from protocol.geometry import optical_axis
+from protocol.geometry import Floats, optical_axis
 from protocol.importance import ImportanceField
 from protocol.mission import Sensing, Target
 from protocol.sensing import owned_shares
@@ -46,9 +48,9 @@ def random_phi(field: VirtualField, seed: int) -> np.ndarray:
 
 @pytest.mark.parametrize("team", [random_team, close_team])
 @pytest.mark.parametrize("drones", [1, 2, 4, 7])
-def test_one_tick_equals_the_dense_formula(team, drones: int) -> None:
+def test_one_tick_equals_the_dense_formula(team: Callable[[int, int], Floats], drones: int) -> None:
     field = VirtualField.of(TARGET)
-    poses = team(drones, seed=drones)
+    poses = team(drones, drones)
     importance = ImportanceField(field, SENSING)
     importance.phi[:] = random_phi(field, seed=5)
     before = importance.phi.astype(np.float64)

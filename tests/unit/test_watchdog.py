@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import pytest
 
 from agents.watchdog import Watchdog
-from protocol.errors import VehicleError
+from protocol.errors import BusError
 
 TIMEOUT_S = 0.5
 QUICK_S = 0.02
@@ -32,7 +32,7 @@ class Bench:
 
     def _stop(self) -> None:
         if self.broken:
-            raise VehicleError("no link")
+            raise BusError("no link")
         self.stops += 1
 
     def check_after(self, seconds: float) -> bool:
@@ -87,7 +87,7 @@ def test_a_vehicle_that_could_not_be_told_is_told_again() -> None:
     bench = Bench(broken=True)
     bench.watchdog.feed()
     for _ in range(2):
-        with pytest.raises(VehicleError):
+        with pytest.raises(BusError):
             bench.check_after(2 * TIMEOUT_S)
     assert bench.watchdog.stops == 0
 
@@ -130,7 +130,7 @@ def test_the_thread_goes_on_after_a_vehicle_could_not_be_told() -> None:
 
     def stop() -> None:
         if next(failures):
-            raise VehicleError("no link")
+            raise BusError("no link")
         told.set()
 
     with Watchdog(stop, time.monotonic, QUICK_S) as watchdog:
