@@ -14,6 +14,7 @@ Its outcome is a value, never an exception.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -21,7 +22,6 @@ import numpy as np
 import osqp
 import scipy.sparse as sparse
 from numba import njit
-from numpy.typing import NDArray
 
 from agents.barriers import Rows
 from protocol.geometry import Floats
@@ -68,6 +68,15 @@ class Solution:
 
 
 @njit(cache=True, nogil=True)
+def _length(coefficients: Floats, row: int) -> float:
+    """Euclidean norm of one row; written out, because slices cost more than the sum."""
+    square = 0.0
+    for i in range(coefficients.shape[1]):
+        square += coefficients[row, i] * coefficients[row, i]
+    return max(math.sqrt(square), 1e-9)
+
+
+@njit(cache=True, nogil=True)
 def _fill(
     xi1: Floats,
     xi2: float,
@@ -87,7 +96,10 @@ def _fill(
     ``quadratic`` and ``linear`` (6,), ``lower`` and ``upper`` (rows,), and the columns of the constraint ``matrix``
     one after another: five with sampling, own bound and all strict rows, and the slack's with its single entry.
     """
-    reach = max(1e-3, (np.abs(xi1) * np.maximum(-low, high)).sum())
+    reach = 0.0
+    for i in range(_INPUTS):
+        reach += abs(xi1[i]) * max(-low[i], high[i])
+    reach = max(1e-3, reach)
     cost = reach * max(abs(xi2), reach)
     quadratic[:_INPUTS] = max(2 * effort / cost, EFFORT_FLOOR)
     quadratic[_INPUTS] = 2 * reach * reach / cost
@@ -101,7 +113,7 @@ def _fill(
         matrix[i * column + 2 : (i + 1) * column] = 0.0
     for k in range(bounds.size):
         # Scaled to unit length, a residual is a velocity whatever the row's unit.
-        length = max(np.sqrt((coefficients[k] * coefficients[k]).sum()), 1e-9)
+        length = _length(coefficients, k)
         for i in range(_INPUTS):
             matrix[i * column + 2 + k] = coefficients[k, i] / length
         lower[_STRICT + k] = bounds[k] / length + TOLERANCE
@@ -109,15 +121,24 @@ def _fill(
 
 
 @njit(cache=True, nogil=True)
-def _activity(
-    velocity: Floats, coefficients: Floats, bounds: Floats, low: Floats, high: Floats
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which strict rows, and which of the five inputs' bounds, hold with equality."""
-    rows = np.empty(bounds.size, np.bool_)
+def _read(
+    found: Floats, coefficients: Floats, bounds: Floats, low: Floats, high: Floats
+) -> tuple[Floats, list[int], list[int]]:
+    """The velocity (5,) within its bounds, and which strict rows and which inputs' bounds hold with equality."""
+    velocity = np.empty(_INPUTS)
+    limited = []
+    for i in range(_INPUTS):
+        velocity[i] = min(max(found[i], low[i]), high[i])
+        if velocity[i] - low[i] < ACTIVE or high[i] - velocity[i] < ACTIVE:
+            limited.append(i)
+    tight = []
     for k in range(bounds.size):
-        length = max(np.sqrt((coefficients[k] * coefficients[k]).sum()), 1e-9)
-        rows[k] = (coefficients[k] * velocity).sum() - bounds[k] < ACTIVE * length
-    return rows, (velocity - low < ACTIVE) | (high - velocity < ACTIVE)
+        margin = -bounds[k]
+        for i in range(_INPUTS):
+            margin += coefficients[k, i] * velocity[i]
+        if margin < ACTIVE * _length(coefficients, k):
+            tight.append(k)
+    return velocity, tight, limited
 
 
 class QuadraticProgram:
@@ -187,8 +208,6 @@ class QuadraticProgram:
         found = np.array(solver.solution.x)
         if outcome != "solved" or not np.isfinite(found).all():
             return Solution("numerical" if outcome == "solved" else outcome, np.zeros(_INPUTS), 0.0, ())
-        velocity = np.minimum(np.maximum(found[:_INPUTS], low), high)
-        tight, limited = _activity(velocity, rows.coefficients, rows.bounds, low, high)
-        active = [name for name, held in zip(rows.names, tight, strict=True) if held]
-        active += [name for name, held in zip(_AXES, limited, strict=True) if held]
+        velocity, tight, limited = _read(found, rows.coefficients, rows.bounds, low, high)
+        active = [rows.names[k] for k in tight] + [_AXES[i] for i in limited]
         return Solution("solved", velocity, min(0.0, float(xi1 @ velocity) + xi2), tuple(active))

@@ -32,35 +32,36 @@ def median_s(action: Callable[[], object], repeats: int) -> float:
     return statistics.median(times)
 
 
-def dense_tick(phi: Floats, positions: Floats, directions: Floats, poses: Floats, sensing: Sensing) -> Floats:
-    """Eqs. (1), (2) and the sums of drone 0's QP row for all cells, as one writes them in NumPy."""
-    senses, sights, ranges, cosines = [], [], [], []
+def dense_tick(phi: Floats, cells: Floats, views: Floats, poses: Floats, sensing: Sensing) -> Floats:
+    """Eqs. (1) and (2) and the sums of drone 0's QP row over the list of all cells, as the paper prints them.
+
+    phi (m,), cells and views (m, 3): Pos(q_j) and Dir(q_j).
+    """
+    senses, geometry = [], []
     for pose in poses:
-        to_cell = positions - pose[:3]
+        to_cell = cells - pose[:3]
         r = np.linalg.norm(to_cell, axis=1)
         sight = to_cell / r[:, None]
-        c1, c2 = sight @ optical_axis(pose[3], pose[4]), -sight @ directions.T
-        h = np.exp(
-            -(
-                (1 - c1) ** 2 / (2 * sensing.sigma_axis**2)
-                + (r - sensing.distance_m) ** 2 / (2 * sensing.sigma_distance_m**2)
-            )[:, None]
-            - (1 - c2) ** 2 / (2 * sensing.sigma_view**2)
+        c1, c2 = sight @ optical_axis(pose[3], pose[4]), -(views * sight).sum(axis=1)
+        senses.append(
+            np.exp(-((1 - c1) ** 2) / (2 * sensing.sigma_axis**2))
+            * np.exp(-((1 - c2) ** 2) / (2 * sensing.sigma_view**2))
+            * np.exp(-((r - sensing.distance_m) ** 2) / (2 * sensing.sigma_distance_m**2))
         )
-        senses.append(h), sights.append(sight), ranges.append(r), cosines.append((c1, c2))
+        geometry.append((r, sight, c1, c2))
     h = np.stack(senses)
     own = (h.argmax(axis=0) == 0) * h[0] * phi
-    (c1, c2), sight, r, pose = cosines[0], sights[0], ranges[0], poses[0]
-    along = own.sum(axis=1) * (1 - c1) / sensing.sigma_axis**2
-    view = own * (1 - c2) / sensing.sigma_view**2
+    (r, sight, c1, c2), pose = geometry[0], poses[0]
     axis = optical_axis(pose[3], pose[4])
+    along = own * (1 - c1) / sensing.sigma_axis**2
+    view = own * (1 - c2) / sensing.sigma_view**2
+    outward = own * (r - sensing.distance_m) / sensing.sigma_distance_m**2
     gradient = np.empty(5)
     gradient[:3] = (
-        (-along / r) @ (axis - c1[:, None] * sight)
-        + (view / r[:, None]).sum(axis=0) @ directions
-        + ((view * c2).sum(axis=1) / r + own.sum(axis=1) * (r - sensing.distance_m) / sensing.sigma_distance_m**2)
-        @ sight
-    )
+        (along / r)[:, None] * (c1[:, None] * sight - axis)
+        + (view / r)[:, None] * (views + c2[:, None] * sight)
+        + outward[:, None] * sight
+    ).sum(axis=0)
     cy, sy, cp, sp = np.cos(pose[3]), np.sin(pose[3]), np.cos(pose[4]), np.sin(pose[4])
     gradient[3] = along @ (sight @ np.array([-sy * cp, cy * cp, 0.0]))
     gradient[4] = along @ (sight @ np.array([-cy * sp, -sy * sp, -cp]))
@@ -72,12 +73,15 @@ def test_field_tick(record: Record) -> None:
     """Decay of four drones and one drone's terms over 117,600 cells; the issue's bar is 100 times."""
     field, sensing, poses = VirtualField.of(Target()), Sensing(), np.array(STARTS)
     importance = ImportanceField(field, sensing)
-    phi, positions = np.ones(field.shape), field.positions()
-    gradient = dense_tick(phi, positions, field.directions, poses, sensing)
+    rows, directions = field.shape
+    phi = np.ones(field.size)
+    cells = field.positions().repeat(directions, axis=0)
+    views = np.tile(field.directions, (rows, 1))
+    gradient = dense_tick(phi, cells, views, poses, sensing)
     terms = importance.advance(poses, DT, 0)
     assert np.allclose(terms.gradient, gradient, rtol=1e-4, atol=1e-4 * np.abs(gradient).max())
     windowed = median_s(lambda: [importance.advance(poses, DT, 0) for _ in range(50)], 15) / 50
-    dense = median_s(lambda: dense_tick(phi, positions, field.directions, poses, sensing), 7)
+    dense = median_s(lambda: dense_tick(phi, cells, views, poses, sensing), 7)
     record("field_tick_117600", windowed * 1e3, "ms CPU", "dense NumPy float64", dense / windowed)
 
 

@@ -102,14 +102,14 @@ def fly(tmp_path: Path) -> Iterator[Fly]:
 
 
 def processes_of(folder: Path, module: str = "") -> list[int]:
-    """Processes, ours only, that were started with a path in ``folder``."""
+    """Processes that were started with a path in ``folder``, all or those of one module."""
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
         try:
             command = (entry / "cmdline").read_bytes().decode(errors="replace")
         except OSError:
             continue  # it ended while we looked
-        if str(folder) in command and module in command:
+        if str(folder) in command and (not module or f"\0-m\0{module}\0" in command):
             found.append(int(entry.name))
     return found
 

@@ -135,7 +135,7 @@ def test_the_targets_faces_belong_to_it_and_nan_does_not() -> None:
 def test_mean_feedback_never_exceeds_one_even_with_a_kernel_narrower_than_the_grid() -> None:
     everywhere = np.repeat(grid_points(0.3), 9, axis=0).astype(np.float32)
     for kernel_m in (0.4, 1e-4):
-        h2 = GridMeshChange(TARGET, Feedback(kernel_m=kernel_m), AXES).update(everywhere)
+        h2 = GridMeshChange(TARGET, Feedback(kernel_m=kernel_m, spacing_m=0.3), AXES).update(everywhere)
         assert 0.99 < h2.min() <= h2.max() <= 1
 
 

@@ -204,13 +204,13 @@ def test_a_run_that_never_took_off_gets_a_page(tmp_path: Path) -> None:
 def test_too_near_and_worse_than_a_floor_are_marked(tmp_path: Path) -> None:
     poor = Scores(visible=Score.of(0.5, 0.5), exposed=Score.of(0.9, 0.9), objects=Score.of(0.9, 0.9))
     mission = team(2, flight={"separation_m": 1.2})
-    folder = flown(tmp_path, mission, mapped=False, scores=poor, finished=False)
-    run = RunFolder(folder, mission)
-    run.record_tick(TICKS, 20.0, {1: (0, 0, 1, 0, 1), 2: (1.1, 0, 1, 0, 1)}, {}, {}, {})
-    final = Metrics(20.0, TICKS, 0.1, poor, 0, 0)
+    run = RunFolder(tmp_path, mission)
+    run.record_tick(0, 0.0, {1: (0, 0, 1, 0, 1), 2: (1.1, 0, 1, 0, 1)}, {}, {}, {})
+    final = Metrics(0.0, 0, 0.1, poor, 0, 0)
+    run.record_metrics(final)
     run.finish(final, floor_baseline=FLOOR, phi_sha256="0", wall_time_s=1.0, exit_reason="stopped")
     run.close()
-    text = write_report(folder).read_text(encoding="utf-8")
+    text = write_report(tmp_path).read_text(encoding="utf-8")
     marked = re.findall(r'class="kpi (\w*)"><dt>([^<]*)', text)
     assert [label for state, label in marked if state == "bad"] == ["F-score, visible", "Nearest approach"]
     assert [label for state, label in marked if state == "good"] == ["F-score, exposed", "F-score, objects"]
