@@ -20,6 +20,7 @@ from ground_station.evaluation import Scores
 from ground_station.feedback import FeedbackSchedule
 from ground_station.journal import Journal
 from ground_station.mapper import Mapper, MapUpdate
+from ground_station.rehearsal import rehearse
 from ground_station.results import Metrics, RunFolder
 from ground_station.status import StatusBoard
 from protocol import topics
@@ -344,9 +345,11 @@ class GroundStation:
 
 async def run_ground_station(mission: Mission, endpoint: str, folder: Path, *, lockstep: bool) -> None:
     """Be the ground station, and the router, of ``mission``; results go to ``folder``."""
-    compile_kernels()
     run = RunFolder(folder, mission)
     try:
+        compile_kernels()
+        log.info("rehearsing the map")
+        rehearse(mission)
         with Journal(folder / "journal") as journal:
             async with connect(endpoint, mission.name, router=True, lossless=lockstep) as bus:
                 await GroundStation(mission, bus, run, journal, lockstep=lockstep).run()

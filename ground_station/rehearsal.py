@@ -1,0 +1,57 @@
+"""Runs the map once over made-up images, so that numba compiles before the mission and not in its first seconds."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ground_station.reconstruction.backends import make_reconstructor
+from ground_station.reconstruction.reconstructor import Keyframe
+from protocol.geometry import camera_rotation
+from protocol.mission import Camera, Mission, Reconstruction, Target
+
+HEIGHT_M = 1.2
+"""Of the camera above the floor of the target."""
+STEP_PX = 12
+"""Between two images; 7 cm on the floor."""
+IMAGES = 12
+"""Enough for the first ones to be compared, confirmed and fused."""
+TICKS_APART = 10
+PATCH_PX = 8
+
+
+def rehearse(mission: Mission) -> int:
+    """Map a flat, randomly patterned floor seen from a camera that moves sideways; how many images were fused.
+
+    Of ``mission`` it takes the backend alone: compiling does not depend on sizes. It takes half a second, or the better
+    part of a minute on a machine that has not compiled yet.
+    """
+    backend = Reconstruction(backend=mission.reconstruction.backend)
+    mission = mission.model_copy(update={"camera": Camera(), "target": Target(), "reconstruction": backend})
+    intrinsics = mission.camera.intrinsics()
+    lower, upper = np.array(mission.target.lower_m), np.array(mission.target.upper_m)
+    rotation = camera_rotation(0.0, np.pi / 2)
+    patches = np.random.default_rng(0).integers(
+        0, 255, (intrinsics.height // PATCH_PX + 1, (intrinsics.width + IMAGES * STEP_PX) // PATCH_PX + 1, 3)
+    )
+    floor = patches.repeat(PATCH_PX, axis=0).repeat(PATCH_PX, axis=1).astype(np.uint8)
+    centre = np.array([*(lower[:2] + upper[:2]) / 2, lower[2] + HEIGHT_M])
+    step_m = STEP_PX * HEIGHT_M / intrinsics.fx
+    reconstructor = make_reconstructor(mission)
+    for k in range(IMAGES):
+        column = k * STEP_PX
+        reconstructor.add(
+            [
+                Keyframe(
+                    drone=1,
+                    sequence=k,
+                    tick=k * TICKS_APART,
+                    image=np.ascontiguousarray(floor[: intrinsics.height, column : column + intrinsics.width]),
+                    position=centre + rotation[:, 0] * step_m * (k - IMAGES / 2),
+                    rotation=rotation,
+                    intrinsics=intrinsics,
+                )
+            ]
+        )
+    reconstructor.flush()
+    reconstructor.mesh()
+    return reconstructor.statistics().fused

@@ -1,0 +1,22 @@
+"""What is compiled before the mission is what the mission runs: the rehearsal gets as far as a fused map."""
+
+from __future__ import annotations
+
+from ground_station.rehearsal import IMAGES, rehearse
+from protocol.mission import Camera, Drone, Mission, Reconstruction
+
+DRONES = (Drone(id=1, start=(0.0, 0.0, 2.0, 0.0, 1.3)),)
+
+
+def test_the_rehearsal_fuses_images() -> None:
+    assert rehearse(Mission(drones=DRONES)) > IMAGES / 2
+
+
+def test_the_rehearsal_does_not_depend_on_the_mission_s_sizes() -> None:
+    small = Camera(width_px=160, height_px=90)
+    sweep = Reconstruction(sweep_width_px=80, depth_planes=16)
+    assert rehearse(Mission(drones=DRONES, camera=small, reconstruction=sweep)) > IMAGES / 2
+
+
+def test_a_mission_without_a_map_is_rehearsed_too() -> None:
+    assert rehearse(Mission(drones=DRONES, reconstruction=Reconstruction(backend="none"))) == IMAGES
