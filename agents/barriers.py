@@ -95,9 +95,10 @@ class Barriers:
         self._region = np.zeros((FIXED_ROWS, 5))
         self._region[1:4, :3], self._region[4:7, :3] = np.eye(3), -np.eye(3)
         self._wide, self._top_speed = widened_separation(flight), top_speed(flight)
-        self._speed = np.array([flight.speed_max_mps] * 3 + [flight.turn_rate_max_radps] * 2)
-        acceleration = [flight.acceleration_max_mps2] * 3 + [flight.angular_acceleration_max_radps2] * 2
-        self._change = np.array(acceleration) * flight.response_time_s if flight.response_time_s else np.full(5, np.inf)
+        self._speed = np.array(flight.velocity_limits)
+        self._change = np.full(5, np.inf)
+        if flight.response_time_s > 0:
+            self._change = np.array(flight.acceleration_limits) * flight.response_time_s
 
     def rows(self, predicted: Floats, neighbours: Sequence[Neighbour]) -> Rows:
         """All strict rows at the predicted pose (5,).

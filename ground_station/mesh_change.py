@@ -14,17 +14,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from protocol.errors import ReconstructionError
+from protocol.field import cell_centres
 from protocol.mission import Box, Feedback
 
 Floats: TypeAlias = NDArray[np.float64]
 Counts: TypeAlias = NDArray[np.int32]
-
-
-def grid_axis(lower_m: float, upper_m: float, spacing_m: float) -> Floats:
-    """Cell centres (K,) of an interval split into the whole number of equal cells nearest to ``spacing_m``."""
-    count = max(1, round((upper_m - lower_m) / spacing_m))
-    edge = (upper_m - lower_m) / count
-    return np.linspace(lower_m + edge / 2, upper_m - edge / 2, count)
 
 
 @njit(cache=True, nogil=True)
@@ -82,7 +76,8 @@ class GridMeshChange:
         self._lower = np.array(target.lower_m)
         self._upper = np.array(target.upper_m)
         grid = [
-            grid_axis(low, high, feedback.spacing_m) for low, high in zip(target.lower_m, target.upper_m, strict=True)
+            cell_centres(low, high, feedback.spacing_m)
+            for low, high in zip(target.lower_m, target.upper_m, strict=True)
         ]
         self._shape = (len(grid[0]), len(grid[1]), len(grid[2]))
         normalised = feedback.normalisation == "mean"

@@ -14,7 +14,6 @@ import csv
 import hashlib
 import importlib.metadata
 import io
-import itertools
 import json
 import math
 import os
@@ -28,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ground_station.evaluation import Scores
+from ground_station.separation import nearest_distances
 from protocol.errors import MissionError
 from protocol.mission import Mission
 
@@ -173,10 +173,8 @@ class RunFolder:
         self._solve_times.append([solve_times_s.get(drone, math.nan) for drone in self._drones])
         self._slacks.append([slacks.get(drone, math.nan) for drone in self._drones])
         self._fallbacks.append([fallbacks.get(drone, "") for drone in self._drones])
-        for one, other in itertools.combinations(poses, 2):
-            distance = math.dist(poses[one][:3], poses[other][:3])
-            self._separations[one] = min(self._separations[one], distance)
-            self._separations[other] = min(self._separations[other], distance)
+        for drone, distance in nearest_distances(poses).items():
+            self._separations[drone] = min(self._separations[drone], distance)
             self._min_separation = min(self._min_separation, distance)
 
     def record_metrics(self, metrics: Metrics) -> None:

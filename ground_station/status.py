@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 
 from ground_station.results import Metrics
+from ground_station.separation import nearest_distances
 from protocol.messages import Control, DroneState, DroneStatus, Phase, Status
 from protocol.mission import Mission
 
@@ -43,11 +43,7 @@ class StatusBoard:
         self._lives = frozenset(alive)
 
     def note_poses(self, poses: Mapping[int, Sequence[float]]) -> None:
-        self._nearest = dict.fromkeys(poses, math.inf)
-        for one, other in itertools.combinations(poses, 2):
-            distance = math.dist(poses[one][:3], poses[other][:3])
-            self._nearest[one] = min(self._nearest[one], distance)
-            self._nearest[other] = min(self._nearest[other], distance)
+        self._nearest = nearest_distances(poses)
         self._separation = min(self._separation, *self._nearest.values(), math.inf)
 
     def controls(self, drones: Iterable[int]) -> dict[int, Control]:

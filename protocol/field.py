@@ -15,8 +15,9 @@ from protocol.geometry import Floats
 from protocol.mission import Target
 
 
-def _cell_centres(low: float, high: float, wished: float) -> Floats:
-    """Centres of the equal cells whose edge is nearest to ``wished``; see ARCHITECTURE.md, departure 4."""
+def cell_centres(low: float, high: float, wished: float) -> Floats:
+    """Centres (cells,) of the equal cells of [low, high] whose edge is nearest to ``wished``, at least one; see
+    ARCHITECTURE.md, departure 4."""
     count = max(1, round((high - low) / wished))
     edge = (high - low) / count
     return low + edge * (np.arange(count, dtype=np.float64) + 0.5)
@@ -36,10 +37,10 @@ class VirtualField:
     @classmethod
     def of(cls, target: Target) -> Self:
         xs, ys, zs = (
-            _cell_centres(low, high, target.cell_m) for low, high in zip(target.lower_m, target.upper_m, strict=True)
+            cell_centres(low, high, target.cell_m) for low, high in zip(target.lower_m, target.upper_m, strict=True)
         )
-        yaws = _cell_centres(*target.yaw_rad, target.cell_rad)
-        pitches = _cell_centres(*target.pitch_rad, target.cell_rad)
+        yaws = cell_centres(*target.yaw_rad, target.cell_rad)
+        pitches = cell_centres(*target.pitch_rad, target.cell_rad)
         yaw, pitch = (grid.ravel() for grid in np.meshgrid(yaws, pitches, indexing="ij"))
         directions = np.column_stack([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
         return cls(xs, ys, zs, np.ascontiguousarray(directions))

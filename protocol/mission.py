@@ -104,6 +104,16 @@ class Flight(Box):
     setpoint_timeout_s: Positive = 0.5
     """A vehicle whose setpoints stop for so long is braked, whatever the control task does."""
 
+    @property
+    def velocity_limits(self) -> tuple[float, float, float, float, float]:
+        """Largest x, y, z, yaw and pitch rate, m/s and rad/s."""
+        return (self.speed_max_mps,) * 3 + (self.turn_rate_max_radps,) * 2
+
+    @property
+    def acceleration_limits(self) -> tuple[float, float, float, float, float]:
+        """Likewise of the accelerations."""
+        return (self.acceleration_max_mps2,) * 3 + (self.angular_acceleration_max_radps2,) * 2
+
     @model_validator(mode="after")
     def _limits_ascend(self) -> Self:
         low, high = self.pitch_limits_rad

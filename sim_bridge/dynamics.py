@@ -27,7 +27,7 @@ class VehicleBody:
 
     def command(self, velocity: Floats, now_s: float, flight: Flight) -> None:
         """Accept a setpoint, clipped to what the vehicle can fly."""
-        limit = np.array([flight.speed_max_mps] * 3 + [flight.turn_rate_max_radps] * 2)
+        limit = np.array(flight.velocity_limits)
         self.commanded = np.clip(velocity, -limit, limit)
         self.commanded_at_s = now_s
 
@@ -38,19 +38,25 @@ class VehicleBody:
         """
         if now_s - self.commanded_at_s > flight.setpoint_timeout_s:
             self.commanded = np.zeros(5)
-        limits = (flight.acceleration_max_mps2, flight.angular_acceleration_max_radps2)
-        self.pose, self.velocity = _follow(self.pose, self.velocity, self.commanded, limits, flight.response_time_s, dt)
+        self.pose, self.velocity = _follow(
+            self.pose, self.velocity, self.commanded, flight.acceleration_limits, flight.response_time_s, dt
+        )
 
 
 @njit(cache=True, nogil=True)
 def _follow(
-    pose: Floats, velocity: Floats, commanded: Floats, limits: tuple[float, float], tau: float, dt: float
+    pose: Floats,
+    velocity: Floats,
+    commanded: Floats,
+    limits: tuple[float, float, float, float, float],
+    tau: float,
+    dt: float,
 ) -> tuple[Floats, Floats]:
-    """Pose and velocity (5,) after ``dt``; ``limits`` are the accelerations of position and of the camera's angles."""
+    """Pose and velocity (5,) after ``dt``; ``limits`` are those of the accelerations."""
     approach = 1.0 if tau == 0 else -math.expm1(-dt / tau)
     new_pose, new_velocity = pose.copy(), velocity.copy()
     for axis in range(5):
-        limit = limits[0] if axis < 3 else limits[1]
+        limit = limits[axis]
         wanted = commanded[axis] - velocity[axis]
         if abs(wanted) > limit * max(tau, dt):  # the whole step at full acceleration
             change = math.copysign(min(limit * dt, abs(wanted * approach)), wanted)

@@ -15,7 +15,7 @@ from protocol.mission import Flight
 class SimulatedVehicle:
     def __init__(self, bus: Bus, drone: int, flight: Flight) -> None:
         self._bus, self._drone = bus, drone
-        self._limit = np.array([flight.speed_max_mps] * 3 + [flight.turn_rate_max_radps] * 2)
+        self._limit = np.array(flight.velocity_limits)
         self._telemetry: Telemetry | None = None
         self._tick = 0
         bus.on(topics.TICK, self._hear)

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from ground_station.mesh_change import GridMeshChange, count_vertices, grid_axis
+from ground_station.mesh_change import GridMeshChange, count_vertices
 from protocol.errors import ReconstructionError
-from protocol.field import VirtualField
+from protocol.field import VirtualField, cell_centres
 from protocol.geometry import Floats
 from protocol.mission import Feedback, Target
 
@@ -23,7 +23,7 @@ Normalisation = Literal["sum", "mean"]
 
 
 def grid_points(spacing_m: float) -> Floats:
-    axes = [grid_axis(low, high, spacing_m) for low, high in zip(TARGET.lower_m, TARGET.upper_m, strict=True)]
+    axes = [cell_centres(low, high, spacing_m) for low, high in zip(TARGET.lower_m, TARGET.upper_m, strict=True)]
     return np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")], axis=1)
 
 
@@ -98,7 +98,7 @@ def test_feedback_is_strongest_where_the_mesh_changed() -> None:
 @settings(max_examples=60, deadline=None)
 def test_every_vertex_in_the_target_counts_once_at_a_nearest_point(vertices: np.ndarray) -> None:
     spacing = 0.3
-    axes = [grid_axis(low, high, spacing) for low, high in zip(TARGET.lower_m, TARGET.upper_m, strict=True)]
+    axes = [cell_centres(low, high, spacing) for low, high in zip(TARGET.lower_m, TARGET.upper_m, strict=True)]
     shape = (len(axes[0]), len(axes[1]), len(axes[2]))
     lower, upper = np.array(TARGET.lower_m), np.array(TARGET.upper_m)
     total = np.zeros(shape, int)
@@ -141,7 +141,7 @@ def test_mean_feedback_never_exceeds_one_even_with_a_kernel_narrower_than_the_gr
 
 @pytest.mark.parametrize(("length_m", "spacing_m", "cells"), [(6.0, 0.3, 20), (2.0, 0.3, 7), (0.1, 0.3, 1)])
 def test_the_grid_divides_the_target_evenly(length_m: float, spacing_m: float, cells: int) -> None:
-    axis = grid_axis(-1.0, length_m - 1.0, spacing_m)
+    axis = cell_centres(-1.0, length_m - 1.0, spacing_m)
     assert len(axis) == cells
     np.testing.assert_allclose([axis[0] + 1, length_m - 1 - axis[-1]], length_m / cells / 2)
 
