@@ -31,8 +31,9 @@ from protocol.wire import decode
 
 log = logging.getLogger(__name__)
 
-LOCKSTEP_PATIENCE_S = 5.0
-"""Wall time to wait for a live neighbour's state or a jump in lockstep; it only runs out when a process hangs."""
+LOCKSTEP_PATIENCE_S = 20.0
+"""Wall time to wait for a live neighbour's state or a jump in lockstep; it only runs out when a process hangs. Shorter
+than the simulator's, or one that hangs would make all look hung."""
 REAL_TIME_PATIENCE_S = 0.01
 """The same in real time: a fifth of a tick. Whoever is later has its decay left out of this replica's tick."""
 IDLE_TIMEOUT_S = 1.0

@@ -71,7 +71,7 @@ class PlainDisplay:
             f"{status.time_s:7.1f} s",
             f"J {status.importance:.3f}",
             f"F visible {status.f_score_visible:.3f} objects {status.f_score_objects:.3f}",
-            f"keyframes {status.keyframes} ({status.keyframes_per_s:.1f}/s, {status.dropped} lost)",
+            f"keyframes {status.keyframes} ({status.keyframes_per_s:.1f}/s, {status.dropped} unused)",
             f"jumps {status.jumps}",
             f"separation {status.min_separation_m:.2f} m",
             f"drones {alive}/{len(status.drones)}",
@@ -118,7 +118,7 @@ class LiveDisplay:
         facts.add_row("F visible", f"{status.f_score_visible:.3f}", "F objects", f"{status.f_score_objects:.3f}")
         facts.add_row(
             "keyframes",
-            f"{status.keyframes} ({status.dropped} lost)",
+            f"{status.keyframes} ({status.dropped} unused)",
             "a second",
             f"{status.keyframes_per_s:.1f}",
         )

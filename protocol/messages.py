@@ -186,7 +186,7 @@ class Status(Message):
     f_score_objects: Finite
     keyframes: Count
     dropped: Count
-    """Keyframes lost or refused."""
+    """Keyframes that were lost, or refused because the map cannot use them."""
     keyframes_per_s: Finite
     """Per second of wall time."""
     jumps: Count

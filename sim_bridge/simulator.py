@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 START_PATIENCE_S = 120.0
 """For all processes to import, compile and connect on a slow machine."""
-LOCKSTEP_PATIENCE_S = 30.0
+LOCKSTEP_PATIENCE_S = 60.0
 """An agent that has not answered for so long is flown around: its vehicle brakes, the others go on."""
 GROUND_PATIENCE_S = 120.0
 """The ground station may be busy reconstructing; only its death or this ends the run."""
