@@ -14,6 +14,7 @@ from deploy.local import Role, mission_roles, supervise
 from deploy.outcome import describe, read_outcome
 from deploy.progress import Display, follow
 from deploy.run_folder import make_run_folder, socket_endpoint, socket_folder_parent
+from ground_station.rehearsal import rehearse
 from protocol.errors import ProcessError
 from protocol.importance import compile_kernels
 from protocol.mission import Mission
@@ -28,9 +29,7 @@ def fly(mission: Mission, display: Display, *, out: Path, speed: Speed, started:
         run = make_run_folder(out, mission, started, endpoint)
         roles = mission_roles(run, endpoint, [drone.id for drone in mission.drones], speed)
         with display:
-            # Compiled once here, not in every process at the same time.
-            compile_kernels()
-            CoverageController(mission, neighbours=1).rehearse()
+            compile_everything(mission)
             display.say(f"{mission.name}: drones {len(mission.drones)}, seed {mission.seed}, run folder {run}")
             result = asyncio.run(_supervise_and_show(roles, run, Path(private), endpoint, mission, display))
     try:
@@ -42,6 +41,17 @@ def fly(mission: Mission, display: Display, *, out: Path, speed: Speed, started:
         # A run that ended early said why already.
         display.say(f"no result: {error}")
     return result
+
+
+def compile_everything(mission: Mission) -> None:
+    """Let numba compile here what the processes will run, once and not in all of them at the same time.
+
+    A process that compiled a kernel itself runs a slightly different one than those that load it from the cache
+    (inlined, with fast-math), so without this the first run on a machine would differ from all later ones.
+    """
+    compile_kernels()
+    CoverageController(mission, neighbours=1).rehearse()
+    rehearse(mission)
 
 
 async def _supervise_and_show(
