@@ -36,7 +36,8 @@ LOCKSTEP_PATIENCE_S = 20.0
 than the simulator's, or one that hangs would make all look hung."""
 REAL_TIME_PATIENCE_S = 0.01
 """The same in real time: a fifth of a tick. Whoever is later has its decay left out of this replica's tick."""
-IDLE_TIMEOUT_S = 1.0
+IDLE_TIMEOUT_S = 0.2
+"""How often an agent without ticks looks whether the mission is over; less than any setpoint time-out."""
 SHARE_PERIOD_S = 1.0
 """How often |V_i| is counted anew."""
 UNLIMITED = 1e9
