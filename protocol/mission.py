@@ -277,6 +277,18 @@ class Mission(Settings):
                         f"drones.{index}.start: {gap:.2f} m from drone {self.drones[other].id},"
                         f" less than flight.separation_m {self.flight.separation_m:g}"
                     )
+        gain = self.controller.separation_gain_per_s * self.tick_s
+        if gain > 0.5:
+            faults.append(
+                f"controller.separation_gain_per_s: times the tick is {gain:g}, must be at most 0.5:"
+                " two drones could pass their barrier within one tick"
+            )
+        turn = self.flight.turn_rate_max_radps * self.tick_s
+        if high - low < 2 * turn:
+            faults.append(
+                f"flight.pitch_limits_rad: {high - low:g} apart, must be at least {2 * turn:g}:"
+                " the gimbal could pass a limit within one tick"
+            )
         if self.reconstruction.nearest_m >= self.reconstruction.farthest_m:
             faults.append("reconstruction.nearest_m: must be less than farthest_m")
         if faults:

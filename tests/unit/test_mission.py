@@ -148,3 +148,15 @@ def test_settings_never_change_after_loading() -> None:
     mission = Mission.model_validate(TWO)
     with pytest.raises(ValidationError, match="frozen"):
         mission.flight.separation_m = 0.1
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"controller": {"separation_gain_per_s": 11.0}}, "controller.separation_gain_per_s: times the tick is 0.55"),
+        ({"flight": {"pitch_limits_rad": (1.28, 1.32)}}, "flight.pitch_limits_rad: 0.04 apart"),
+    ],
+)
+def test_limits_that_one_tick_could_jump_over_are_refused(settings: dict[str, object], said: str) -> None:
+    with pytest.raises(ValidationError, match=said):
+        Mission.model_validate({"drones": [{"id": 1, "start": (0.0, 0.0, 2.0, 0.0, 1.3)}], **settings})
