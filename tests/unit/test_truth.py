@@ -85,7 +85,7 @@ def test_floor_deep_under_a_canopy_is_exposed_but_no_steep_view_reaches_it(tmp_p
 def test_sides_are_not_visible_to_a_mission_that_looks_straight_down_with_a_narrow_lens(tmp_path: Path) -> None:
     down = mission(
         camera=Camera(horizontal_fov_rad=0.11),
-        flight=Flight(pitch_limits_rad=(math.pi / 2 - 0.01, math.pi / 2)),
+        flight=Flight(pitch_limits_rad=(math.pi / 2 - 0.01, math.pi / 2), turn_rate_max_radps=0.05),
     )
     truth = write_truth(stage(), down, tmp_path, cache=tmp_path / "cache")
     sides = on_cube(truth) & (truth.points[:, 2] < 0.99999)
