@@ -81,6 +81,7 @@ class GroundStation:
         self._board = StatusBoard(mission)
         self._received: deque[Keyframe] = deque()
         self._keyframes = 0
+        self._handed = 0  # to the map; in lockstep the simulator may be some ticks and images ahead
         self._mapped = 0
         self._dropped = 0
         self._scores: Scores | None = None
@@ -182,6 +183,7 @@ class GroundStation:
         self._received = deque(keyframe for keyframe in self._received if keyframe.tick >= tick.tick)
         if not ready:
             return
+        self._handed += len(ready)
         if not self._lockstep and len(self._adding) >= KEYFRAME_BACKLOG:
             self._dropped += len(ready)
             return
@@ -265,7 +267,7 @@ class GroundStation:
             importance=self._replica.field.importance,
             scores=self._scores,
             jumps=self._journal.next_sequence,
-            keyframes=self._keyframes,
+            keyframes=self._handed,
         )
 
     def _publish_head(self, tick: int) -> None:
@@ -301,7 +303,7 @@ class GroundStation:
         status = self._board.status(
             self._metrics(),
             phase=self._phase,
-            backlog=self._keyframes - self._mapped,
+            backlog=self._handed - self._mapped,
             dropped=self._dropped + self._mapper.refused,
             alive=self._bus.alive,
             now_s=asyncio.get_running_loop().time(),
