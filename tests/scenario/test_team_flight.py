@@ -91,7 +91,7 @@ def test_importance_falls_as_fast_as_measured_on_the_paper_s_equations(
 ) -> None:
     """The reference times of the plain equations: bounds +-0.5, no feedback; mean over four first headings.
 
-    A single flight is chaotic, its times spread by 10 % with any detail of the start. The paper says where the first
+    A single flight is chaotic: with these headings its times lie between -6 and +7 % of the reference. The paper says where the first
     drone starts; the others stand in a row beside it.
     """
     halves, quarters = [], []
