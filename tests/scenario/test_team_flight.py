@@ -91,8 +91,8 @@ def test_importance_falls_as_fast_as_measured_on_the_paper_s_equations(
 ) -> None:
     """The reference times of the plain equations: bounds +-0.5, no feedback; mean over four first headings.
 
-    A single flight is chaotic: with these headings its times lie between -6 and +7 % of the reference. The paper says where the first
-    drone starts; the others stand in a row beside it.
+    A single flight is chaotic: with these headings its times lie between -6 and +7 % of the reference. The paper says
+    where the first drone starts; the others stand in a row beside it.
     """
     halves, quarters = [], []
     for yaw in (0.0, math.pi / 2, math.pi, -math.pi / 2):
