@@ -259,7 +259,7 @@ class Mission(Settings):
         return 1.0 / self.controller.rate_hz
 
     @model_validator(mode="after")
-    def _team_can_start(self) -> Self:
+    def _parts_fit_together(self) -> Self:
         faults = []
         ids = [drone.id for drone in self.drones]
         if len(set(ids)) != len(ids):
