@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Literal, NoReturn
 
 from cyclopts import App, Parameter
+from cyclopts.validators import Number
 
 from protocol.errors import CovreconError, MissionError, SceneError
 from protocol.guard import require_own_packages
@@ -59,9 +60,10 @@ def run(
     speed: Literal["max", "1"] = "max",
     headless: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     seed: Seed = None,
+    restart: Annotated[int, Parameter(validator=Number(gte=0))] = 0,
     out: Path = Path("runs"),
 ) -> int:
-    """Fly a mission: simulator, ground station and one process a drone, all on this machine.
+    """Fly a mission: router, simulator, ground station and one process a drone, all on this machine.
 
     Parameters
     ----------
@@ -69,6 +71,8 @@ def run(
         "max": as fast as the machine allows, the same seed gives the same result. "1": real time.
     headless
         Plain lines instead of the live table.
+    restart
+        How often each process but the simulator is started again when it dies.
     out
         Where the run's folder is made.
     """
@@ -87,7 +91,7 @@ def run(
         if console.is_terminal and not headless
         else PlainDisplay(lambda text: print(text, flush=True))
     )
-    return fly(checked, display, out=out, speed=speed, started=datetime.now(UTC))
+    return fly(checked, display, out=out, speed=speed, started=datetime.now(UTC), restarts=restart)
 
 
 @app.command
@@ -146,4 +150,5 @@ def _process(command: str, module: str, what: str) -> None:
 
 _process("agent", "agents", "one drone")
 _process("ground", "ground_station", "the ground station")
+_process("router", "protocol.router", "the router")
 _process("sim", "sim_bridge", "the simulator")

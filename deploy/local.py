@@ -1,18 +1,21 @@
-"""All processes of a mission on this machine: started, watched, and ended together.
+"""All processes of a mission on this machine: started, watched, started again if so wished, and ended together.
 
-The ground station's end is the run's end. A drone that dies is told about and the others fly on; without the ground
-station or the simulator nothing can go on, so their failure ends the run. Whatever happens, also to the launcher
-itself, no process and no socket stays behind (`deploy.reaper`).
+The ground station's end is the run's end. A drone that dies is told about and the others fly on; without the router,
+the ground station or the simulator nothing can go on, so their failure ends the run, unless they may be started again.
+The simulator may not: it is the world. Whatever happens, also to the launcher itself, no process and no socket stays
+behind (`deploy.reaper`).
 """
 
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 import shutil
 import signal
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass
@@ -33,7 +36,7 @@ LOG_BYTES = 16 * 1024
 BAD_INPUT = 2
 """Exit code of a process that refuses its mission, scene or endpoint; any other failure is 1."""
 
-Kind = Literal["ground", "sim", "agent"]
+Kind = Literal["router", "ground", "sim", "agent"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +59,7 @@ def environment(outer: Mapping[str, str]) -> dict[str, str]:
 
 
 def mission_roles(run: Path, endpoint: str, drones: Sequence[int], speed: str) -> list[Role]:
-    """Simulator, ground station and one agent a drone; all read ``mission.json`` in the run folder."""
+    """Router, simulator, ground station and one agent a drone; all read ``mission.json`` in the run folder."""
 
     def role(name: str, kind: Kind, module: str, *more: str) -> Role:
         # -P keeps the folder that the launcher was called in from shadowing a package.
@@ -64,6 +67,7 @@ def mission_roles(run: Path, endpoint: str, drones: Sequence[int], speed: str) -
         return Role(name, kind, (*command, "--endpoint", endpoint, "--run", str(run), "--speed", speed, *more))
 
     return [
+        role("router", "router", "protocol.router"),
         role("sim", "sim", "sim_bridge"),
         role("ground", "ground", "ground_station"),
         *(role(f"drone-{drone}", "agent", "agents", "--drone", str(drone)) for drone in drones),
@@ -76,68 +80,91 @@ async def supervise(
     logs: Path,
     private: Path,
     say: Callable[[str], None],
+    restarts: int = 0,
     grace_s: float = GRACE_S,
     settle_s: float = SETTLE_S,
 ) -> int:
     """Start ``roles`` in order and stay until the run is over; its exit code, 0 only if every process ended well.
 
     Each process writes to its own file in the folder ``logs``. ``private``, the socket's folder, is removed at the
-    end. ``say`` gets what a person should know. Raises `ProcessError` when a command cannot be started.
+    end. ``say`` gets what a person should know. A router, ground station or agent that dies of anything but bad input
+    is started again up to ``restarts`` times, and then counts as one that never died. Raises `ProcessError` when a
+    command cannot be started.
     """
-    waits: dict[asyncio.Task[int], Role] = {}
+    run = _Run(logs, say, restarts)
     with _interruption() as interrupted:
         try:
-            async with _process_group(private, grace_s) as group:
+            async with process_group(private, grace_s) as group:
                 for role in roles:
-                    process = await _start(role, logs / f"{role.name}.log", group)
-                    waits[asyncio.create_task(process.wait())] = role
-                return await _watch(dict(waits), interrupted, logs, say, settle_s)
+                    await run.start(role, group)
+                return await run.watch(interrupted, group, settle_s)
         finally:
-            await asyncio.gather(*waits)  # all have ended: take their exit codes, so that no zombie stays
+            await asyncio.gather(*run.waits)  # all have ended: take their exit codes, so that no zombie stays
 
 
-async def _watch(
-    waits: dict[asyncio.Task[int], Role],
-    interrupted: asyncio.Future[signal.Signals],
-    logs: Path,
-    say: Callable[[str], None],
-    settle_s: float,
-) -> int:
-    clock = asyncio.get_running_loop().time
-    deadline: float | None = None
-    drone_ended_well = False
-    result = 0
-    while waits:
-        patience = None if deadline is None else max(0.0, deadline - clock())
-        watched: set[asyncio.Future[Any]] = {*waits, interrupted}
-        await asyncio.wait(watched, timeout=patience, return_when=asyncio.FIRST_COMPLETED)
-        if interrupted.done():
-            number = interrupted.result()
-            say(f"{number.name}: ending the run")
-            return 128 + number
-        ended = [task for task in waits if task.done()]
-        if not ended:
-            say(f"not ended {settle_s:g} s after the ground station: {', '.join(role.name for role in waits.values())}")
-            return 1
-        hopeless = False
-        for task in ended:
-            role, code = waits.pop(task), task.result()
-            if code != 0:
-                say(_obituary(role, code, logs))
-                result = result or (BAD_INPUT if code == BAD_INPUT else 1)
-                hopeless |= role.kind != "agent"
-            elif role.kind == "agent":
-                drone_ended_well = True
-            elif role.kind == "ground":
-                deadline = clock() + settle_s
-        drones_left = any(role.kind == "agent" for role in waits.values())
-        if hopeless or (result != 0 and not drones_left and not drone_ended_well):
-            return result
-    return result
+class _Run:
+    """The processes of one run that are still waited for, and what the ends of the others came to."""
+
+    def __init__(self, logs: Path, say: Callable[[str], None], restarts: int) -> None:
+        self._logs, self._say, self._restarts = logs, say, restarts
+        self._restarted: Counter[str] = Counter()
+        self._result = 0
+        self._over = False
+        """The ground station has ended well."""
+        self._hopeless = False
+        self._drone_ended_well = False
+        self.waits: dict[asyncio.Task[int], Role] = {}
+
+    async def start(self, role: Role, group: int) -> None:
+        process = await _start(role, self._logs / f"{role.name}.log", group)
+        self.waits[asyncio.create_task(process.wait())] = role
+
+    async def watch(self, interrupted: asyncio.Future[signal.Signals], group: int, settle_s: float) -> int:
+        clock = asyncio.get_running_loop().time
+        deadline = math.inf
+        while left := [role.name for role in self.waits.values() if role.kind != "router"]:
+            patience = None if deadline == math.inf else max(0.0, deadline - clock())
+            watched: set[asyncio.Future[Any]] = {*self.waits, interrupted}
+            await asyncio.wait(watched, timeout=patience, return_when=asyncio.FIRST_COMPLETED)
+            if interrupted.done():
+                number = interrupted.result()
+                self._say(f"{number.name}: ending the run")
+                return 128 + number
+            ended = [task for task in self.waits if task.done()]
+            if not ended:
+                self._say(f"not ended {settle_s:g} s after the ground station: {', '.join(left)}")
+                return 1
+            for task in ended:
+                await self._take_end(self.waits.pop(task), task.result(), group)
+            if self._over:
+                deadline = min(deadline, clock() + settle_s)
+            if self._hopeless or (self._result != 0 and not self._drone_ended_well and not self._drones_left()):
+                return self._result
+        return self._result  # the router serves until the others are gone, and goes with the group
+
+    async def _take_end(self, role: Role, code: int, group: int) -> None:
+        if code == 0:
+            self._over |= role.kind == "ground"
+            self._drone_ended_well |= role.kind == "agent"
+        elif self._may_start_again(role, code):
+            self._restarted[role.name] += 1
+            self._say(f"{role.name} {_death(code)}; started again ({self._restarted[role.name]} of {self._restarts})")
+            await self.start(role, group)
+        else:
+            self._say(_obituary(role, code, self._logs))
+            self._result = self._result or (BAD_INPUT if code == BAD_INPUT else 1)
+            self._hopeless |= role.kind != "agent"
+
+    def _may_start_again(self, role: Role, code: int) -> bool:
+        mortal = role.kind != "sim" and code != BAD_INPUT and not self._over
+        return mortal and self._restarted[role.name] < self._restarts
+
+    def _drones_left(self) -> bool:
+        return any(role.kind == "agent" for role in self.waits.values())
 
 
 async def _start(role: Role, log: Path, group: int) -> asyncio.subprocess.Process:
-    with log.open("wb") as output:
+    with log.open("ab") as output:  # one that is started again writes on
         try:
             return await asyncio.create_subprocess_exec(
                 *role.command,
@@ -152,7 +179,7 @@ async def _start(role: Role, log: Path, group: int) -> asyncio.subprocess.Proces
 
 
 @asynccontextmanager
-async def _process_group(private: Path, grace_s: float) -> AsyncIterator[int]:
+async def process_group(private: Path, grace_s: float) -> AsyncIterator[int]:
     """A process group that is ended with this context, or with this process; its number."""
     script = Path(__file__).with_name("reaper.py")
     leader = subprocess.Popen(  # noqa: ASYNC220  # a few milliseconds, and nothing else is running yet
@@ -193,10 +220,13 @@ def _interruption() -> Iterator[asyncio.Future[signal.Signals]]:
         received.cancel()
 
 
+def _death(code: int) -> str:
+    return f"ended with exit code {code}" if code > 0 else f"was killed by {signal.Signals(-code).name}"
+
+
 def _obituary(role: Role, code: int, logs: Path) -> str:
     log = logs / f"{role.name}.log"
-    end = f"ended with exit code {code}" if code > 0 else f"was killed by {signal.Signals(-code).name}"
     with log.open("rb") as file:
         file.seek(max(0, log.stat().st_size - LOG_BYTES))
         lines = file.read().decode(errors="replace").splitlines()[-LOG_LINES:]
-    return "\n    ".join([f"{role.name} {end}; end of {log}:", *(lines or ["(empty)"])])
+    return "\n    ".join([f"{role.name} {_death(code)}; end of {log}:", *(lines or ["(empty)"])])

@@ -22,8 +22,11 @@ from protocol.mission import Mission
 Speed = Literal["max", "1"]
 
 
-def fly(mission: Mission, display: Display, *, out: Path, speed: Speed, started: datetime) -> int:
-    """Run ``mission`` on this machine and say how it went; the exit code of the command."""
+def fly(mission: Mission, display: Display, *, out: Path, speed: Speed, started: datetime, restarts: int = 0) -> int:
+    """Run ``mission`` on this machine and say how it went; the exit code of the command.
+
+    A process that dies is started again up to ``restarts`` times, the simulator excepted.
+    """
     with TemporaryDirectory(prefix="covrecon-", dir=socket_folder_parent(), ignore_cleanup_errors=True) as private:
         endpoint = mission.transport.endpoint or socket_endpoint(Path(private))
         run = make_run_folder(out, mission, started, endpoint)
@@ -31,7 +34,7 @@ def fly(mission: Mission, display: Display, *, out: Path, speed: Speed, started:
         with display:
             compile_everything(mission)
             display.say(f"{mission.name}: drones {len(mission.drones)}, seed {mission.seed}, run folder {run}")
-            result = asyncio.run(_supervise_and_show(roles, run, Path(private), endpoint, mission, display))
+            result = asyncio.run(_supervise_and_show(roles, run, Path(private), endpoint, mission, display, restarts))
     try:
         for line in describe(read_outcome(run), run):
             display.say(line)
@@ -55,11 +58,11 @@ def compile_everything(mission: Mission) -> None:
 
 
 async def _supervise_and_show(
-    roles: list[Role], run: Path, private: Path, endpoint: str, mission: Mission, display: Display
+    roles: list[Role], run: Path, private: Path, endpoint: str, mission: Mission, display: Display, restarts: int
 ) -> int:
     watching = asyncio.create_task(follow(endpoint, mission, display))
     try:
-        return await supervise(roles, logs=run / "logs", private=private, say=display.say)
+        return await supervise(roles, logs=run / "logs", private=private, say=display.say, restarts=restarts)
     finally:
         watching.cancel()
         with suppress(asyncio.CancelledError):

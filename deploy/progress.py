@@ -21,7 +21,7 @@ from protocol.mission import Mission
 from protocol.topics import STATUS
 
 CONNECT_S = 60.0
-"""How long the display waits for the ground station's router."""
+"""How long the display waits for the router."""
 LINE_PERIOD_S = 5.0
 """Between two plain lines, wall time."""
 

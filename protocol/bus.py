@@ -2,81 +2,50 @@
 
 zenoh calls back on its own threads. Here they only hand over: a sample goes into its subscription's bounded queue,
 and the event loop is woken once for a whole burst. Handlers then run in the loop, in order, and `Bus.until`
-re-checks what is being waited for. Lost, late and refused messages are counted, never guessed at.
+re-checks what is being waited for. Lost, late and refused messages are counted, never guessed at, and a handler or
+an answer that fails costs its own message alone.
+
+While the router is away, zenoh drops what is put, answers no question, and says of everybody that they are gone;
+when it is back, all that was declared here is declared to it again.
 """
 
 from __future__ import annotations
 
 import asyncio
-import json
+import logging
+import threading
 from collections import Counter, deque
-from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import zenoh
 
 from protocol.errors import BusError, MessageError, NoReply
+from protocol.session import errors_of, open_session
 from protocol.topics import Topic, alive_key
-from protocol.wire import MAX_MESSAGE_BYTES, Message, decode, encode
+from protocol.wire import Message, decode, encode
 
 M = TypeVar("M", bound=Message)
 T = TypeVar("T")
 
-CONNECT_RETRY_S = 0.2
-LEASE_MS = 2000
-"""A process that vanishes without closing is noticed after 0.75 to 1 lease."""
-BLOCK_MS = 500
-"""How long a lossless put may wait for a slow link before the link is given up."""
+log = logging.getLogger(__name__)
+
 QUERY_TIMEOUT_S = 2.0
-
-
-def _config(mode: Literal["router", "client"], endpoint: str, namespace: str) -> zenoh.Config:
-    place = "listen" if mode == "router" else "connect"
-    settings: dict[str, Any] = {
-        "mode": mode,
-        place: {"endpoints": [endpoint]},
-        "namespace": namespace,
-        "timestamping": {"enabled": False},
-        "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "transport": {
-            "shared_memory": {"enabled": False},
-            "link": {
-                "tx": {
-                    "lease": LEASE_MS,
-                    "queue": {"congestion_control": {"block": {"wait_before_close": BLOCK_MS * 1000}}},
-                },
-                "rx": {"max_message_size": MAX_MESSAGE_BYTES},
-            },
-        },
-    }
-    if mode == "client":
-        settings["connect"] |= {
-            "timeout_ms": 2000,
-            "retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
-        }
-    return zenoh.Config.from_json5(json.dumps(settings))
-
-
-@contextmanager
-def _errors_of(what: str) -> Iterator[None]:
-    """zenoh's errors as `BusError`, without the place in its source that it appends."""
-    try:
-        yield
-    except zenoh.ZError as error:
-        raise BusError(f"{what}: {str(error).partition(' at /')[0]}") from error
 
 
 @dataclass(slots=True)
 class _Subscription:
     """One key's queue between zenoh's thread and the loop, and who reads it."""
 
+    key: str
     topic: Topic[Any]
-    handlers: list[Callable[[Any], None]]
-    queue: deque[bytes]
-    handle: object = None
+    take: Callable[[], bytes | None]
+    """The oldest message that waits."""
+    handle: object
     """Kept because zenoh undeclares a subscriber that nobody refers to."""
+    handlers: list[Callable[[Any], None]] = field(default_factory=list)
 
 
 @dataclass(slots=True)
@@ -84,7 +53,9 @@ class BusStatistics:
     refused: Counter[str] = field(default_factory=Counter)
     """Messages that did not decode, by topic."""
     dropped: Counter[str] = field(default_factory=Counter)
-    """Messages that a full queue lost, by topic."""
+    """Messages and questions that a full queue lost, by topic."""
+    failed: Counter[str] = field(default_factory=Counter)
+    """Messages and questions that made their handler raise, by topic."""
 
 
 class Bus:
@@ -97,16 +68,19 @@ class Bus:
     def __init__(self, session: zenoh.Session, *, lossless: bool) -> None:
         self._session = session
         self._loop = asyncio.get_running_loop()
-        self._lossless = lossless
-        self._subscriptions: dict[str, _Subscription] = {}
+        # Not BLOCK_FIRST either: on a narrow link it ends the session, and with a router that stands still it keeps
+        # zenoh from noticing for ten seconds and more.
+        self._congestion_control = zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP
+        self._subscriptions: dict[tuple[str, bool], _Subscription] = {}
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._declared: list[object] = []
+        self._answers: set[asyncio.Task[None]] = set()
         self._waiting: list[tuple[Callable[[], bool], asyncio.Future[bool]]] = []
         self._woken = False
         self._closed = False
         self._lives: deque[tuple[str, bool]] = deque()
         self.alive: set[str] = set()
-        """Roles with a liveliness token: "ground", "sim", "drone/1" ..."""
+        """Roles with a liveliness token: "ground", "sim", "drone/1" ...; nobody while the router is away."""
         self.statistics = BusStatistics()
 
     # --- sending -------------------------------------------------------------------------------------------------
@@ -117,13 +91,12 @@ class Bus:
 
     def put_encoded(self, topic: Topic[Any], payload: bytes, drone: int | str = "") -> None:
         key = topic.of(drone)
-        with _errors_of(key):
+        with errors_of(key):
             publisher = self._publishers.get(key)
             if publisher is None:
-                control = zenoh.CongestionControl.BLOCK if self._lossless else zenoh.CongestionControl.DROP
                 publisher = self._session.declare_publisher(
                     key,
-                    congestion_control=control,
+                    congestion_control=self._congestion_control,
                     priority=getattr(zenoh.Priority, topic.priority),
                     express=topic.express,
                 )
@@ -132,27 +105,48 @@ class Bus:
 
     # --- receiving -----------------------------------------------------------------------------------------------
 
-    def on(self, topic: Topic[M], handler: Callable[[M], None], drone: int | str = "*") -> None:
-        """Call ``handler`` in the loop with each message; several handlers share one subscription."""
+    def on(self, topic: Topic[M], handler: Callable[[M], None], drone: int | str = "*", *, wakes: bool = True) -> None:
+        """Call ``handler`` in the loop with each message; several handlers share one subscription.
+
+        ``wakes=False`` is for what is read once a tick, and costs about half the CPU: no message of this topic runs
+        Python or wakes the loop by itself; it is handled when something else does, or by `poll`. What a full queue
+        lost is then not in the statistics, because zenoh does not tell: readers count gaps in tick or sequence.
+        """
         key = topic.of(drone)
-        known = self._subscriptions.get(key)
-        if known is not None:
-            known.handlers.append(handler)
-            return
-        subscription = _Subscription(topic, [handler], deque(maxlen=topic.queue))
-        self._subscriptions[key] = subscription
+        subscription = self._subscriptions.get((key, wakes))
+        if subscription is None:
+            with errors_of(key):
+                subscription = (self._declare_waking if wakes else self._declare_ring)(key, topic)
+            self._subscriptions[key, wakes] = subscription
+        subscription.handlers.append(handler)
+
+    def _declare_waking(self, key: str, topic: Topic[Any]) -> _Subscription:
+        queue: deque[bytes] = deque(maxlen=topic.queue)
 
         def arrive(sample: zenoh.Sample) -> None:
-            if len(subscription.queue) == topic.queue:
+            if len(queue) == topic.queue:
                 self.statistics.dropped[key] += 1
-            subscription.queue.append(sample.payload.to_bytes())
+            queue.append(sample.payload.to_bytes())
             self._wake()
 
-        with _errors_of(key):
-            subscription.handle = self._session.declare_subscriber(key, arrive, allowed_origin=zenoh.Locality.REMOTE)
+        handle = self._session.declare_subscriber(key, arrive, allowed_origin=zenoh.Locality.REMOTE)
+        return _Subscription(key, topic, lambda: queue.popleft() if queue else None, handle)
+
+    def _declare_ring(self, key: str, topic: Topic[Any]) -> _Subscription:
+        ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(topic.queue)
+        handle = self._session.declare_subscriber(key, ring, allowed_origin=zenoh.Locality.REMOTE)
+
+        def take() -> bytes | None:
+            sample = handle.try_recv()
+            return None if sample is None else sample.payload.to_bytes()
+
+        return _Subscription(key, topic, take, handle)
 
     async def until(self, condition: Callable[[], bool], timeout_s: float) -> bool:
-        """Wait until ``condition`` holds, checked after each burst of messages; False when time ran out."""
+        """Wait until ``condition`` holds, checked after each burst of messages; False when time ran out.
+
+        What ``condition`` raises is raised here.
+        """
         if condition():
             return True
         future: asyncio.Future[bool] = self._loop.create_future()
@@ -168,39 +162,71 @@ class Bus:
     def recheck(self) -> None:
         """Tell `until` that something other than a message has changed."""
         for condition, future in self._waiting:
-            if not future.done() and condition():
-                _settle(future, True)
+            if future.done():
+                continue
+            try:
+                holds = condition()
+            except Exception as error:  # noqa: BLE001 - raised where it is waited for, not in whoever woke us
+                future.set_exception(error)
+                continue
+            if holds:
+                future.set_result(True)
+
+    def poll(self) -> None:
+        """Handle now all that has arrived, also what does not wake."""
+        if self._closed:
+            raise BusError("poll: session closed")
+        self._drain()
 
     def _wake(self) -> None:
         if self._woken or self._closed:
             return
         self._woken = True
         try:
-            self._loop.call_soon_threadsafe(self._drain)
+            self._loop.call_soon_threadsafe(self._drain_unless_closed)
         except RuntimeError:  # the loop was closed while a zenoh thread was still handing over
             self._closed = True
+
+    def _drain_unless_closed(self) -> None:
+        if not self._closed:
+            self._drain()
 
     def _drain(self) -> None:
         self._woken = False
         while self._lives:
             role, alive = self._lives.popleft()
             (self.alive.add if alive else self.alive.discard)(role)
-        for key, subscription in list(self._subscriptions.items()):
-            for _ in range(len(subscription.queue)):
-                try:
-                    message = decode(subscription.topic.message, subscription.queue.popleft())
-                except MessageError:
-                    self.statistics.refused[key] += 1
-                    continue
-                for handler in subscription.handlers:
-                    handler(message)
+        for subscription in list(self._subscriptions.values()):
+            for _ in range(subscription.topic.queue):
+                payload = subscription.take()
+                if payload is None:
+                    break
+                self._deliver(subscription, payload)
         self.recheck()
+
+    def _deliver(self, subscription: _Subscription, payload: bytes) -> None:
+        try:
+            message = decode(subscription.topic.message, payload)
+        except MessageError:
+            self.statistics.refused[subscription.key] += 1
+            return
+        for handler in subscription.handlers:
+            try:
+                handler(message)
+            except Exception as error:  # noqa: BLE001 - a fault in one reader must not cost the others their messages
+                self._fail(subscription.key, error)
+
+    def _fail(self, key: str, error: Exception) -> None:
+        """Count, and log the 1st, 2nd, 4th, 8th ...: a storm of failures must not fill the disk."""
+        self.statistics.failed[key] += 1
+        if self.statistics.failed[key].bit_count() == 1:
+            log.error("%s: failure %d", key, self.statistics.failed[key], exc_info=error)
 
     # --- liveliness ----------------------------------------------------------------------------------------------
 
     def announce(self, role: str) -> None:
         """Declare this process alive; call it after everything it answers to is declared."""
-        with _errors_of(alive_key(role)):
+        with errors_of(alive_key(role)):
             self._declared.append(self._session.liveliness().declare_token(alive_key(role)))
 
     def watch_lives(self) -> None:
@@ -212,36 +238,70 @@ class Bus:
             self._lives.append((role, sample.kind == zenoh.SampleKind.PUT))
             self._wake()
 
-        with _errors_of(alive_key("**")):
+        with errors_of(alive_key("**")):
             self._declared.append(self._session.liveliness().declare_subscriber(alive_key("**"), change, history=True))
 
     # --- queries -------------------------------------------------------------------------------------------------
 
-    def serve(self, topic: Topic[M], answer: Callable[[dict[str, str]], M]) -> None:
-        """Answer queries for ``topic``: ``answer`` runs in the loop with the selector's parameters."""
+    def serve(self, topic: Topic[M], answer: Callable[[dict[str, str]], Awaitable[M]], drone: int | str = "") -> None:
+        """Answer queries for ``topic``: ``answer`` runs as a task of the loop with the selector's parameters.
 
-        def reply(query: zenoh.Query) -> None:
-            with query:
-                try:
-                    query.reply(topic.key, encode(answer(parse_parameters(str(query.parameters)))))
-                except MessageError as error:
-                    query.reply_err(str(error).encode())
+        It refuses a query by `MessageError`, and must end by itself when it waits for something: zenoh does not tell
+        that the asker gave up. At most ``topic.queue`` run at once; further queries get no answer, and are counted.
+        """
+        key = topic.of(drone)
+        places = threading.Semaphore(topic.queue)
+
+        async def reply(query: zenoh.Query) -> None:
+            refusal = b"failed"
+            payload = b""
+            try:
+                payload = encode(await answer(parse_parameters(str(query.parameters))))
+            except MessageError as error:
+                refusal = str(error).encode()
+            except Exception as error:  # noqa: BLE001 - a question must not end the process that is asked
+                self._fail(key, error)
+            try:
+                with errors_of(key):
+                    if payload:
+                        query.reply(key, payload)
+                    else:
+                        query.reply_err(refusal)
+            except BusError as error:
+                log.warning("cannot reply: %s", error)
+
+        def end(query: zenoh.Query, task: asyncio.Task[None]) -> None:
+            self._answers.discard(task)
+            places.release()
+            _drop(query)
+
+        def start(query: zenoh.Query) -> None:
+            task = self._loop.create_task(reply(query))
+            self._answers.add(task)
+            task.add_done_callback(lambda task: end(query, task))
 
         def arrive(query: zenoh.Query) -> None:
-            try:
-                self._loop.call_soon_threadsafe(reply, query)
-            except RuntimeError:  # closed: the query's drop tells the asker
+            if not places.acquire(blocking=False):
+                self.statistics.dropped[key] += 1
+                _drop(query)
                 return
+            try:
+                self._loop.call_soon_threadsafe(start, query)
+            except RuntimeError:  # closed
+                _drop(query)
 
-        with _errors_of(topic.key):
-            self._declared.append(self._session.declare_queryable(topic.key, arrive))
+        with errors_of(key):
+            self._declared.append(self._session.declare_queryable(key, arrive))
 
-    async def ask(self, topic: Topic[M], parameters: str) -> M:
+    async def ask(
+        self, topic: Topic[M], parameters: str, drone: int | str = "", timeout_s: float = QUERY_TIMEOUT_S
+    ) -> M:
         """The first valid answer to a query.
 
         Raises:
             NoReply: nobody answered in time; with zenoh an empty answer is no "no", so ask again.
         """
+        key = topic.of(drone)
         replies: list[bytes] = []
         done: asyncio.Future[None] = self._loop.create_future()
 
@@ -259,19 +319,33 @@ class Bus:
             post(_settle, done, None)
 
         callback = zenoh.handlers.Callback(arrive, finish, indirect=False)
-        with _errors_of(topic.key):
-            self._session.get(f"{topic.key}?{parameters}", callback, timeout=QUERY_TIMEOUT_S)
+        with errors_of(key):
+            self._session.get(
+                f"{key}?{parameters}",
+                callback,
+                timeout=timeout_s,
+                congestion_control=self._congestion_control,
+                priority=getattr(zenoh.Priority, topic.priority),
+            )
         await done
         for payload in replies:
             try:
                 return decode(topic.message, payload)
             except MessageError:
-                self.statistics.refused[topic.key] += 1
-        raise NoReply(f"{topic.key}?{parameters}: no valid answer")
+                self.statistics.refused[key] += 1
+        raise NoReply(f"{key}?{parameters}: no valid answer")
 
-    def close(self) -> None:
+    async def close(self) -> None:
         self._closed = True
-        self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub leaves it untyped
+        for task in self._answers:
+            task.cancel()
+        await asyncio.gather(*self._answers, return_exceptions=True)
+        # Closing joins zenoh's threads, which may be about to call into this loop.
+        try:
+            with errors_of("close"):
+                await asyncio.to_thread(self._session.close)
+        except BusError as error:  # a link that lets nothing through: zenoh waited for it and has given up
+            log.warning("%s", error)
 
 
 @asynccontextmanager
@@ -291,31 +365,21 @@ async def connect(
     Raises:
         BusError: the endpoint is malformed, taken, or nobody listened in time.
     """
-    loop = asyncio.get_running_loop()
-    deadline = loop.time() + timeout_s
-    what = f"cannot {'listen at' if router else 'reach'} {endpoint or 'an empty endpoint'}"
-    with _errors_of(what):
-        config = _config("router" if router else "client", endpoint, f"covrecon/{mission}")
-    while True:
-        try:
-            with _errors_of(what):
-                session = await asyncio.to_thread(zenoh.open, config)
-            break
-        except BusError:
-            if router or loop.time() > deadline:
-                raise
-            await asyncio.sleep(CONNECT_RETRY_S)
-    bus = Bus(session, lossless=lossless)
+    bus = Bus(await open_session(endpoint, mission, router=router, timeout_s=timeout_s), lossless=lossless)
     try:
         yield bus
     finally:
-        # Closing joins zenoh's threads, which may be about to call into this loop.
-        await asyncio.to_thread(bus.close)
+        await bus.close()
 
 
 def parse_parameters(selector: str) -> dict[str, str]:
     """``"from=3;to=9"`` as a dictionary."""
     return {key: value for key, _, value in (part.partition("=") for part in selector.split(";")) if key}
+
+
+def _drop(query: zenoh.Query) -> None:
+    """End a query: without it the asker waits for its whole time-out."""
+    query.drop()  # type: ignore[no-untyped-call]  # zenoh's stub leaves it untyped
 
 
 def _settle(future: asyncio.Future[T], result: T) -> None:

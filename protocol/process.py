@@ -1,4 +1,4 @@
-"""What the three kinds of process have in common: arguments, logging, signals and exit codes."""
+"""What all processes of a mission have in common: arguments, logging, signals and exit codes."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def parse(role: str, arguments: list[str] | None = None) -> Arguments:
     """
     parser = argparse.ArgumentParser(prog=f"python -m {role}")
     parser.add_argument("--mission", type=Path, required=True, help="mission file, TOML or JSON")
-    parser.add_argument("--endpoint", required=True, help="zenoh endpoint of the ground station")
+    parser.add_argument("--endpoint", required=True, help="zenoh endpoint of the router")
     parser.add_argument("--run", type=Path, required=True, help="folder for results and logs")
     parser.add_argument("--speed", choices=("max", "1"), default="1", help="max: lockstep; 1: real time")
     if role == "agents":

@@ -9,21 +9,47 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
+import zenoh
 
 from deploy.run_folder import socket_endpoint, socket_folder_parent
 from protocol import topics
 from protocol.bus import Bus, connect, parse_parameters
-from protocol.errors import BusError, NoReply
+from protocol.errors import BusError, MessageError, NoReply
 from protocol.guard import ROOT
-from protocol.messages import DroneState, JournalPage, Jump, JumpHead, MissionPhase
+from protocol.messages import JournalPage, Jump, JumpHead, Keyframe, MissionPhase
+from protocol.topics import Topic
 from protocol.wire import MAX_MESSAGE_BYTES, encode
 
 PATIENCE_S = 20.0
+IMAGES, IMAGE_BYTES = 40, 150_000
+"""More than the buffers between sender and receiver hold: sockets' and zenoh's queues, about 3 MB."""
+BEAT_S, BEATS_PER_IMAGE = 0.01, 5
+LATE_S, LATE_SHARE = 0.1, 0.1
+"""A put that blocks until the frozen link is given up makes a fifth of all messages later than this."""
+PRIVATE = Topic("drone/{drone}/private", JournalPage, "agent", "BACKGROUND", 4, 1.0, False, queryable=True)
+KEYFRAME = Keyframe(
+    drone=1,
+    sequence=0,
+    tick=0,
+    position=(0.0, 0.0, 0.0),
+    rotation=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    width=320,
+    height=180,
+    fx=1.0,
+    fy=1.0,
+    cx=0.0,
+    cy=0.0,
+    jpeg=b"",
+)
 CLIENT = """
 import asyncio, sys
 from protocol import topics
@@ -42,6 +68,44 @@ async def main() -> None:
 
 asyncio.run(main())
 """
+
+ROUTER = """
+import asyncio, sys
+from protocol.bus import connect
+
+async def main() -> None:
+    async with connect(sys.argv[1], "m", router=True):
+        print("there", flush=True)
+        await asyncio.Event().wait()
+
+asyncio.run(main())
+"""
+LISTENER = """
+import asyncio, sys
+from protocol import topics
+from protocol.bus import connect
+
+async def main() -> None:
+    async with connect(sys.argv[1], "m") as bus:
+        bus.on(topics.KEYFRAME, lambda _: None)
+        bus.on(topics.HEAD, lambda _: None)
+        print("there", flush=True)
+        await asyncio.Event().wait()
+
+asyncio.run(main())
+"""
+
+
+@contextmanager
+def process(script: str, endpoint: str) -> Iterator[subprocess.Popen[bytes]]:
+    """A process that has said that it is there; killed at the end."""
+    with subprocess.Popen([sys.executable, "-c", script, endpoint], cwd=ROOT, stdout=subprocess.PIPE) as started:
+        try:
+            assert started.stdout is not None
+            assert started.stdout.readline() == b"there\n"
+            yield started
+        finally:
+            started.kill()
 
 
 @pytest.fixture
@@ -66,8 +130,16 @@ async def drone(endpoint: str, ground: Bus) -> AsyncIterator[Bus]:
         yield bus
 
 
+def page(epoch: int) -> JournalPage:
+    return JournalPage(epoch=epoch, first_sequence=0, next_sequence=0, jumps=())
+
+
 def head(done: int) -> JumpHead:
     return JumpHead(epoch=1, next_sequence=0, done=done, phase="flying")
+
+
+async def no_answer(parameters: dict[str, str]) -> JournalPage:
+    raise MessageError(f"nothing at {parameters}")
 
 
 async def there(bus: Bus, other: Bus, role: str = "drone/1") -> None:
@@ -113,21 +185,11 @@ async def test_several_handlers_share_a_key_and_each_hears_all(ground: Bus, dron
 async def test_each_drone_has_its_key_and_one_can_listen_to_all_or_to_one(ground: Bus, drone: Bus) -> None:
     all_of_them: list[int] = []
     second: list[int] = []
-    ground.on(topics.STATE, lambda state: all_of_them.append(state.drone))
-    ground.on(topics.STATE, lambda state: second.append(state.drone), drone=2)
+    ground.on(topics.KEYFRAME, lambda frame: all_of_them.append(frame.drone))
+    ground.on(topics.KEYFRAME, lambda frame: second.append(frame.drone), drone=2)
     await there(drone, ground, "ground")
     for number in (1, 2, 3):
-        state = DroneState(
-            drone=number,
-            tick=0,
-            pose=(0.0, 0.0, 2.0, 0.0, 1.3),
-            velocity=(0.0, 0.0, 0.0, 0.0, 0.0),
-            battery=1.0,
-            mode="flying",
-            importance=1.0,
-            control=None,
-        )
-        drone.put(topics.STATE, state, number)
+        drone.put(topics.KEYFRAME, KEYFRAME.model_copy(update={"drone": number}), number)
 
     assert await ground.until(lambda: len(all_of_them) == 3 and bool(second), PATIENCE_S)
     assert (all_of_them, second) == ([1, 2, 3], [2])
@@ -195,6 +257,108 @@ async def test_bytes_that_are_no_message_are_counted_and_later_ones_still_heard(
     assert await drone.until(lambda: bool(heard), PATIENCE_S)
     assert heard == [5]
     assert drone.statistics.refused == {topics.HEAD.key: 4}
+
+
+async def test_what_does_not_wake_is_handled_with_what_does(ground: Bus, drone: Bus) -> None:
+    heard: list[object] = []
+    drone.on(topics.HEAD, lambda message: heard.append(message.done), wakes=False)
+    drone.on(topics.PHASE, lambda message: heard.append(message.reason))
+    await there(ground, drone)
+    assert await drone.until(lambda: "drone/1" in drone.alive, PATIENCE_S), "or the news of it would wake us later"
+
+    for done in range(100):
+        ground.put(topics.HEAD, head(done))
+    assert not await drone.until(lambda: bool(heard), 0.1)
+    ground.put(topics.PHASE, MissionPhase(phase="flying", reason="now"))
+
+    assert await drone.until(lambda: len(heard) == 101, PATIENCE_S)
+    heard.remove("now")
+    assert heard == list(range(100))
+
+
+async def test_what_does_not_wake_is_handled_by_a_poll_and_the_newest_are_kept(ground: Bus, drone: Bus) -> None:
+    room, sent = topics.PHASE.queue, 100
+    heard: list[str] = []
+    last: list[int] = []
+    drone.on(topics.PHASE, lambda message: heard.append(message.reason), wakes=False)
+    drone.on(topics.HEAD, lambda message: last.append(message.done), wakes=False)
+    await there(ground, drone)
+    for number in range(sent):
+        ground.put(topics.PHASE, MissionPhase(phase="flying", reason=str(number)))
+    ground.put(topics.HEAD, head(1))
+
+    def all_are_in() -> bool:
+        drone.poll()
+        return bool(heard) and heard[-1] == str(sent - 1) and bool(last)
+
+    waiting = asyncio.create_task(drone.until(lambda: bool(last), PATIENCE_S))
+    await asyncio.sleep(0)
+    blocked_until(all_are_in)
+    assert await waiting, "a poll rechecks what is waited for"
+    assert heard[-room:] == [str(number) for number in range(sent - room, sent)]
+
+
+async def test_a_key_can_be_heard_both_ways(ground: Bus, drone: Bus) -> None:
+    waking: list[int] = []
+    polled: list[int] = []
+    drone.on(topics.HEAD, lambda message: waking.append(message.done))
+    drone.on(topics.HEAD, lambda message: polled.append(message.done), wakes=False)
+    await there(ground, drone)
+
+    ground.put(topics.HEAD, head(3))
+
+    assert await drone.until(lambda: bool(waking), PATIENCE_S)
+    drone.poll()
+    assert (waking, polled) == ([3], [3])
+
+
+@pytest.mark.parametrize("wakes", [True, False])
+async def test_a_handler_that_fails_costs_nobody_else_a_message(
+    ground: Bus, drone: Bus, wakes: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    heard: list[int] = []
+    last: list[str] = []
+
+    def fail(message: JumpHead) -> None:
+        raise ZeroDivisionError(message.done)
+
+    drone.on(topics.HEAD, fail, wakes=wakes)
+    drone.on(topics.HEAD, lambda message: heard.append(message.done), wakes=wakes)
+    drone.on(topics.PHASE, lambda message: last.append(message.reason))
+    await there(ground, drone)
+
+    for done in range(10):
+        ground.put(topics.HEAD, head(done))
+    ground.put(topics.PHASE, MissionPhase(phase="flying", reason="end"))
+
+    def all_are_in() -> bool:
+        drone.poll()
+        return len(heard) == 10 and bool(last)
+
+    blocked_until(all_are_in)
+    assert heard == list(range(10))
+    assert drone.statistics.failed == {topics.HEAD.key: 10}
+    told = [record for record in caplog.records if record.name == "protocol.bus"]
+    assert [record.args for record in told] == [(topics.HEAD.key, count) for count in (1, 2, 4, 8)]
+    assert all(record.exc_info and record.exc_info[0] is ZeroDivisionError for record in told)
+
+
+async def test_a_condition_that_fails_fails_only_where_it_is_waited_for(ground: Bus, drone: Bus) -> None:
+    heard: list[int] = []
+    drone.on(topics.HEAD, lambda message: heard.append(message.done))
+    await there(ground, drone)
+
+    def fail() -> bool:
+        return bool(heard) and heard[1] == 0
+
+    failing = asyncio.create_task(drone.until(fail, PATIENCE_S))
+    waiting = asyncio.create_task(drone.until(lambda: bool(heard), PATIENCE_S))
+    await asyncio.sleep(0)
+    ground.put(topics.HEAD, head(1))
+
+    assert await waiting
+    with pytest.raises(IndexError):
+        await failing
 
 
 async def test_any_thread_may_put(ground: Bus, drone: Bus) -> None:
@@ -277,16 +441,16 @@ async def test_a_question_is_answered_in_the_loop_with_its_parameters(ground: Bu
     asked: list[tuple[dict[str, str], str]] = []
     jump = encode(Jump(epoch=7, sequence=3, tick=9, increments=np.ones(4, np.float32)))
 
-    def answer(parameters: dict[str, str]) -> JournalPage:
+    async def answer(parameters: dict[str, str]) -> JournalPage:
         asked.append((parameters, threading.current_thread().name))
-        return JournalPage(epoch=7, next_sequence=4, jumps=(jump,))
+        return JournalPage(epoch=7, first_sequence=0, next_sequence=4, jumps=(jump,))
 
     ground.serve(topics.JOURNAL, answer)
     await there(drone, ground, "ground")
 
     page = await drone.ask(topics.JOURNAL, "from=3;to=4")
 
-    assert page == JournalPage(epoch=7, next_sequence=4, jumps=(jump,))
+    assert page == JournalPage(epoch=7, first_sequence=0, next_sequence=4, jumps=(jump,))
     assert asked == [({"from": "3", "to": "4"}, threading.main_thread().name)]
 
 
@@ -297,9 +461,9 @@ async def test_a_question_that_nobody_answers_is_an_error(drone: Bus) -> None:
 
 
 async def test_an_answer_that_is_too_long_to_send_is_no_answer_and_the_next_one_is(ground: Bus, drone: Bus) -> None:
-    def answer(parameters: dict[str, str]) -> JournalPage:
+    async def answer(parameters: dict[str, str]) -> JournalPage:
         jumps = (bytes(MAX_MESSAGE_BYTES),) if parameters["from"] == "0" else ()
-        return JournalPage(epoch=7, next_sequence=0, jumps=jumps)
+        return JournalPage(epoch=7, first_sequence=0, next_sequence=0, jumps=jumps)
 
     ground.serve(topics.JOURNAL, answer)
     await there(drone, ground, "ground")
@@ -308,6 +472,190 @@ async def test_an_answer_that_is_too_long_to_send_is_no_answer_and_the_next_one_
         with pytest.raises(NoReply):
             await drone.ask(topics.JOURNAL, "from=0")
         assert (await drone.ask(topics.JOURNAL, "from=1")).epoch == 7
+
+
+async def test_each_drone_answers_for_itself(ground: Bus, drone: Bus, endpoint: str) -> None:
+    async def answer(parameters: dict[str, str], epoch: int) -> JournalPage:
+        assert parameters == {"from": "0"}
+        return page(epoch)
+
+    async with connect(endpoint, "m") as second:
+        for number, bus in ((1, drone), (2, second)):
+            bus.serve(PRIVATE, partial(answer, epoch=number), number)
+            await there(ground, bus, f"drone/{number}")
+
+        assert [(await ground.ask(PRIVATE, "from=0", number)).epoch for number in (1, 2)] == [1, 2]
+        with pytest.raises(NoReply, match=r"drone/3/private\?from=0"):
+            await ground.ask(PRIVATE, "from=0", 3)
+
+
+async def test_an_answer_that_takes_its_time_keeps_nobody_waiting(ground: Bus, drone: Bus) -> None:
+    may_answer = asyncio.Event()
+
+    async def answer(parameters: dict[str, str]) -> JournalPage:
+        if "slow" in parameters:
+            await may_answer.wait()
+        return page(epoch=len(parameters))
+
+    ground.serve(topics.JOURNAL, answer)
+    await there(drone, ground, "ground")
+    slow = asyncio.create_task(drone.ask(topics.JOURNAL, "slow=1;at=2", timeout_s=PATIENCE_S))
+    with pytest.raises(NoReply):
+        await drone.ask(topics.JOURNAL, "slow=1", timeout_s=0.2)
+
+    assert (await drone.ask(topics.JOURNAL, "from=1")).epoch == 1
+    assert not slow.done()
+    may_answer.set()
+    assert (await slow).epoch == 2
+
+
+@pytest.mark.parametrize(("error", "failures"), [(MessageError("not here"), 0), (KeyError("a mistake"), 1)])
+async def test_a_question_that_is_refused_or_fails_ends_at_once_and_the_next_is_answered(
+    ground: Bus, drone: Bus, error: Exception, failures: int
+) -> None:
+    async def answer(parameters: dict[str, str]) -> JournalPage:
+        if parameters["from"] == "0":
+            raise error
+        return page(epoch=7)
+
+    ground.serve(topics.JOURNAL, answer)
+    await there(drone, ground, "ground")
+
+    async with asyncio.timeout(PATIENCE_S):
+        with pytest.raises(NoReply):
+            await drone.ask(topics.JOURNAL, "from=0", timeout_s=10 * PATIENCE_S)
+        assert (await drone.ask(topics.JOURNAL, "from=1")).epoch == 7
+    assert ground.statistics.failed[topics.JOURNAL.key] == failures
+
+
+async def test_more_questions_than_a_topic_has_room_for_get_no_answer_and_are_counted(ground: Bus, drone: Bus) -> None:
+    may_answer = asyncio.Event()
+
+    async def answer(parameters: dict[str, str]) -> JournalPage:
+        assert not parameters
+        await may_answer.wait()
+        return page(epoch=7)
+
+    ground.serve(topics.JOURNAL, answer)
+    await there(drone, ground, "ground")
+    room, extra = topics.JOURNAL.queue, 5
+
+    async with asyncio.TaskGroup() as group:
+        asked = [group.create_task(_epoch_or_zero(drone)) for _ in range(room + extra)]
+        pending = set(asked)
+        while len(pending) > room:
+            _, pending = await asyncio.wait(pending, timeout=PATIENCE_S, return_when=asyncio.FIRST_COMPLETED)
+        may_answer.set()
+    assert sorted(task.result() for task in asked) == [0] * extra + [7] * room
+    assert ground.statistics.dropped == {topics.JOURNAL.key: extra}
+    assert (await drone.ask(topics.JOURNAL, "")).epoch == 7, "there is room again"
+
+
+async def test_a_process_that_ends_while_it_answers_does_not_let_the_asker_wait(endpoint: str, ground: Bus) -> None:
+    asked = asyncio.Event()
+
+    async def answer(parameters: dict[str, str]) -> JournalPage:
+        assert not parameters
+        asked.set()
+        await asyncio.Event().wait()
+        raise AssertionError
+
+    async with asyncio.timeout(PATIENCE_S):
+        async with connect(endpoint, "m") as other:
+            other.serve(topics.JOURNAL, answer)
+            await there(ground, other)
+            asking = asyncio.create_task(ground.ask(topics.JOURNAL, "", timeout_s=10 * PATIENCE_S))
+            await asked.wait()
+        with pytest.raises(NoReply):
+            await asking
+
+
+async def test_a_router_that_is_killed_and_comes_back_is_all_that_changes(endpoint: str) -> None:
+    """Nothing raises meanwhile, everybody counts as gone, and all that was declared works again."""
+    heard: list[int] = []
+    polled: list[int] = []
+
+    async def answer(parameters: dict[str, str]) -> JournalPage:
+        assert not parameters
+        return page(epoch=7)
+
+    with process(ROUTER, endpoint) as router:
+        async with connect(endpoint, "m") as one, connect(endpoint, "m") as other:
+            other.on(topics.HEAD, lambda message: heard.append(message.done))
+            other.on(topics.HEAD, lambda message: polled.append(message.done), wakes=False)
+            other.serve(topics.JOURNAL, answer)
+            other.watch_lives()
+            one.watch_lives()
+            one.announce("drone/1")
+            await there(one, other, "drone/2")
+
+            router.kill()
+            assert await one.until(lambda: not one.alive, PATIENCE_S)
+            assert await other.until(lambda: not other.alive, PATIENCE_S)
+            one.put(topics.HEAD, head(1))
+            with pytest.raises(NoReply):
+                await one.ask(topics.JOURNAL, "")
+
+            with process(ROUTER, endpoint):
+                assert await one.until(lambda: one.alive == {"drone/1", "drone/2"}, PATIENCE_S)
+                assert await other.until(lambda: other.alive == {"drone/1", "drone/2"}, PATIENCE_S)
+                one.put(topics.HEAD, head(2))
+                assert await other.until(lambda: heard == [2], PATIENCE_S)
+                other.poll()
+                assert polled == [2]
+                assert (await one.ask(topics.JOURNAL, "")).epoch == 7
+
+
+async def test_a_receiver_that_is_frozen_delays_neither_the_sender_nor_the_others(endpoint: str) -> None:
+    """Images beyond all its buffers, put from a thread as the camera does, and small messages on time meanwhile."""
+    frame = KEYFRAME.model_copy(update={"jpeg": bytes(IMAGE_BYTES)})
+    late_s: list[float] = []
+    put_s: list[float] = []
+    async with connect(endpoint, "m", router=True), connect(endpoint, "m") as sender, connect(endpoint, "m") as other:
+        began = time.monotonic()
+        frames: list[int] = []
+        other.on(topics.HEAD, lambda message: late_s.append(time.monotonic() - began - message.done * BEAT_S))
+        other.on(topics.KEYFRAME, lambda message: frames.append(message.sequence))
+        sender.watch_lives()
+        with process(LISTENER, endpoint) as frozen:
+            await there(sender, other)
+            frozen.send_signal(signal.SIGSTOP)
+            began = time.monotonic()
+
+            def shoot() -> None:
+                for sequence in range(IMAGES):
+                    due = began + sequence * BEATS_PER_IMAGE * BEAT_S
+                    time.sleep(max(0.0, due - time.monotonic()))  # the camera's rate, not a wait for something
+                    before = time.monotonic()
+                    sender.put(topics.KEYFRAME, frame.model_copy(update={"sequence": sequence}), 1)
+                    put_s.append(time.monotonic() - before)
+
+            shooting = asyncio.create_task(asyncio.to_thread(shoot))
+            for beat in range(IMAGES * BEATS_PER_IMAGE):
+                await asyncio.sleep(max(0.0, began + beat * BEAT_S - time.monotonic()))
+                sender.put(topics.HEAD, head(beat))
+            await shooting
+            assert await other.until(lambda: len(late_s) == IMAGES * BEATS_PER_IMAGE, PATIENCE_S)
+    assert sum(late > LATE_S for late in late_s) < LATE_SHARE * len(late_s)
+    assert sum(took > LATE_S for took in put_s) < LATE_SHARE * len(put_s)
+    assert len(frames) > 0.9 * IMAGES
+
+
+async def test_a_link_that_cannot_be_closed_in_order_is_told_and_given_up(caplog: pytest.LogCaptureFixture) -> None:
+    class Stuck:
+        def close(self) -> None:
+            raise zenoh.ZError("close operation timed out at /where/it/is.rs:7.")
+
+    await Bus(cast("zenoh.Session", Stuck()), lossless=False).close()
+
+    assert "close: close operation timed out" in caplog.messages
+
+
+async def _epoch_or_zero(bus: Bus) -> int:
+    try:
+        return (await bus.ask(topics.JOURNAL, "", timeout_s=PATIENCE_S)).epoch
+    except NoReply:
+        return 0
 
 
 def test_parameters_are_read_as_far_as_they_make_sense() -> None:
@@ -375,7 +723,8 @@ async def test_a_closed_bus_refuses_everything_with_its_own_error(endpoint: str)
         lambda: bus.on(topics.HEAD, print),
         lambda: bus.announce("ground"),
         bus.watch_lives,
-        lambda: bus.serve(topics.JOURNAL, lambda _: JournalPage(epoch=1, next_sequence=0, jumps=())),
+        lambda: bus.serve(topics.JOURNAL, no_answer),
+        bus.poll,
     ):
         with pytest.raises(BusError, match="session closed"):
             act()

@@ -67,12 +67,20 @@ def wait_for(condition: Callable[[], bool], what: str) -> None:
         time.sleep(0.01)
 
 
-def supervised(run: Path, *roles: Role, grace_s: float = 5.0, settle_s: float = 20.0) -> tuple[int, str]:
+def supervised(
+    run: Path, *roles: Role, restarts: int = 0, grace_s: float = 5.0, settle_s: float = 20.0
+) -> tuple[int, str]:
     """Exit code and what was said; afterwards nothing may be left."""
     said: list[str] = []
     code = asyncio.run(
         supervise(
-            roles, logs=run / "logs", private=run / "private", say=said.append, grace_s=grace_s, settle_s=settle_s
+            roles,
+            logs=run / "logs",
+            private=run / "private",
+            say=said.append,
+            restarts=restarts,
+            grace_s=grace_s,
+            settle_s=settle_s,
         )
     )
     assert living(run) == []
@@ -90,7 +98,7 @@ def test_a_run_in_which_all_end_well_is_a_success(run: Path) -> None:
     assert len(list((run / "pids").iterdir())) == 3
 
 
-@pytest.mark.parametrize("kind", ["sim", "ground"])
+@pytest.mark.parametrize("kind", ["router", "sim", "ground"])
 def test_the_failure_of_a_needed_process_ends_the_run_and_shows_its_log(run: Path, kind: Kind) -> None:
     other: Kind = "ground" if kind == "sim" else "sim"
     crash = "for line in range(100): print('line', line)\nraise SystemExit('the end of it')"
@@ -149,6 +157,78 @@ def test_a_run_whose_last_drone_died_is_ended(run: Path) -> None:
     assert code == 1
     assert "drone-1 ended" in said
     assert "drone-2 ended" in said
+
+
+def test_the_router_serves_until_all_others_have_ended_and_is_then_told_to_end(run: Path) -> None:
+    files = (
+        "import os, pathlib, signal, sys, time\n"
+        "folder = pathlib.Path(os.environ['PIDS']).parent\n"
+        "def wait_for(name):\n"
+        "    while not (folder / name).exists(): time.sleep(0.01)\n"
+    )
+    serve = "signal.signal(signal.SIGTERM, lambda *_: sys.exit(f'told to end, sim done: {(folder / 'sim').exists()}'))"
+
+    code, said = supervised(
+        run,
+        role("router", "router", files + serve.replace("'sim'", '"sim"') + "\n(folder / 'up').touch()\nsignal.pause()"),
+        role("sim", "sim", files + "wait_for('ground'); (folder / 'sim').touch()"),
+        role("ground", "ground", files + "wait_for('up'); (folder / 'ground').touch()"),
+    )
+
+    assert (code, said) == (0, "")
+    assert (run / "logs" / "router.log").read_text() == "told to end, sim done: True\n"
+
+
+DIES_FIRST = (
+    "import os, pathlib, signal\n"
+    "mark = pathlib.Path(os.environ['PIDS'], '../{name}')\n"
+    "print('hello', flush=True)\n"
+    "if len(mark.read_text() if mark.exists() else '') < {deaths}:\n"
+    "    mark.open('a').write('x')\n"
+    "    os.kill(os.getpid(), signal.SIGKILL)\n"
+)
+"""A process that is killed so many times before it goes on."""
+
+
+def test_who_dies_is_started_again_and_then_counts_as_one_that_never_died(run: Path) -> None:
+    code, said = supervised(
+        run,
+        role("ground", "ground", DIES_FIRST.format(name="ground", deaths=2)),
+        role("drone-1", "agent", DIES_FIRST.format(name="drone-1", deaths=1)),
+        restarts=3,
+    )
+
+    assert code == 0
+    assert sorted(said.splitlines()) == [
+        "drone-1 was killed by SIGKILL; started again (1 of 3)",
+        "ground was killed by SIGKILL; started again (1 of 3)",
+        "ground was killed by SIGKILL; started again (2 of 3)",
+    ]
+    assert (run / "logs" / "ground.log").read_text() == "hello\n" * 3
+
+
+def test_who_dies_more_often_than_allowed_ends_the_run(run: Path) -> None:
+    code, said = supervised(
+        run,
+        role("router", "router", STAY),
+        role("sim", "sim", STAY),
+        role("ground", "ground", "raise SystemExit('no use')"),
+        restarts=2,
+    )
+
+    assert code == 1
+    assert [line.partition("; ")[0] for line in said.splitlines()[:3]] == ["ground ended with exit code 1"] * 3
+    assert said.endswith("no use")
+
+
+@pytest.mark.parametrize(
+    ("kind", "program", "code"), [("sim", "raise SystemExit(1)", 1), ("ground", "raise SystemExit(2)", 2)]
+)
+def test_neither_the_world_nor_who_refuses_its_input_is_started_again(
+    run: Path, kind: Kind, program: str, code: int
+) -> None:
+    assert supervised(run, role("broken", kind, program), role("drone-1", "agent", STAY), restarts=3)[0] == code
+    assert len(list((run / "pids").iterdir())) <= 2
 
 
 def test_who_does_not_end_after_the_ground_station_is_ended(run: Path) -> None:

@@ -33,7 +33,7 @@ def test_help_answers_without_heavy_imports() -> None:
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
 
     assert result.returncode == 0
-    assert {"agent", "ground", "mission", "report", "run", "sim"} <= set(result.stdout.split())
+    assert {"agent", "ground", "mission", "report", "router", "run", "sim"} <= set(result.stdout.split())
     assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < HELP_CPU_S
 
 
