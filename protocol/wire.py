@@ -1,12 +1,15 @@
 """Wire format: one MessagePack map of a version, a message name and typed fields, checked by pydantic.
 
 Arrays travel as ``[dtype, shape, little-endian bytes]``. Whatever does not fit exactly - another major version, a
-wrong type, a wrong length, a number that is not finite - is refused with `MessageError`; nothing is guessed.
+wrong type, a wrong length, a number that is not finite - is refused with `MessageError`; nothing is guessed. Nor
+does a length that the bytes only claim cost memory or time before it is refused.
 """
 
 from __future__ import annotations
 
 import math
+import reprlib
+from collections.abc import Callable, Sized
 from typing import Annotated, Any, ClassVar, TypeVar
 
 import msgpack
@@ -19,6 +22,14 @@ from protocol.errors import MessageError, VersionError
 WIRE_VERSION = 1
 """Major version; a new field with a default does not change it."""
 MAX_MESSAGE_BYTES = 16 * 2**20
+MAX_MEMBERS = 2**12
+"""Of one map or tuple; bulk travels as bytes."""
+MAX_DIMENSIONS = 4
+"""Of an array. The product of a shape that is as long as a message takes minutes to compute."""
+MAX_MEMBERS_IN_ALL = 2**16
+"""One byte can be an empty map, which takes Python 64. A message of fewer bytes cannot have more members."""
+PLACE_LETTERS = 40
+"""Of each part of a place that an error names: an unknown field's name is whatever the sender made it."""
 _ARRAY_DTYPES = ("<f4", "<f8", "<i4", "|u1")
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -32,8 +43,10 @@ def _array_from_wire(value: object) -> NDArray[Any]:
             pass
         case _:
             raise ValueError("not an array of [dtype, shape, bytes]")
-    if not all(type(length) is int and length >= 0 for length in shape):
-        raise ValueError(f"shape {shape} is not made of lengths")
+    if len(shape) > MAX_DIMENSIONS:
+        raise ValueError(f"{len(shape)} dimensions exceed the limit of {MAX_DIMENSIONS}")
+    if not all(type(length) is int and 0 <= length <= MAX_MESSAGE_BYTES for length in shape):
+        raise ValueError(f"shape {reprlib.repr(shape)} is not made of lengths")
     if math.prod(shape) * np.dtype(dtype).itemsize != len(data):
         raise ValueError(f"{len(data)} bytes do not fill shape {shape} of {dtype}")
     return _checked(np.frombuffer(data, dtype).reshape(shape))
@@ -43,6 +56,8 @@ def _checked(array: NDArray[Any]) -> NDArray[Any]:
     """Also for the sender's own arrays: what every receiver would refuse must not be journalled or published."""
     if array.dtype.newbyteorder("<").str not in _ARRAY_DTYPES:
         raise ValueError(f"arrays of {array.dtype} do not travel")
+    if array.ndim > MAX_DIMENSIONS:
+        raise ValueError(f"{array.ndim} dimensions exceed the limit of {MAX_DIMENSIONS}")
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise ValueError("holds numbers that are not finite")
     return array
@@ -68,6 +83,7 @@ class Message(BaseModel):
 
 
 M = TypeVar("M", bound=Message)
+C = TypeVar("C", bound=Sized)
 
 
 def encode(message: Message) -> bytes:
@@ -100,19 +116,40 @@ def decode(kind: type[M], data: bytes) -> M:
     if len(data) > MAX_MESSAGE_BYTES:
         raise MessageError(f"{kind.name}: {len(data)} bytes exceed the limit of {MAX_MESSAGE_BYTES}")
     try:
-        fields = msgpack.unpackb(data, use_list=False)
+        fields = _unpacked(data)
     except (ValueError, TypeError, msgpack.UnpackException) as error:
         raise MessageError(f"{kind.name}: not MessagePack: {error}") from error
     if not isinstance(fields, dict):
         raise MessageError(f"{kind.name}: not a map")
     version, name = fields.pop("v", None), fields.pop("n", None)
     if type(version) is not int or version != WIRE_VERSION:  # True and 1.0 equal 1
-        raise VersionError(f"{kind.name}: wire version {version!r}, this process speaks {WIRE_VERSION}")
+        raise VersionError(f"{kind.name}: wire version {reprlib.repr(version)}, this process speaks {WIRE_VERSION}")
     if name != kind.name:
-        raise MessageError(f"{kind.name}: holds a message {name!r}")
+        raise MessageError(f"{kind.name}: holds a message {reprlib.repr(name)}")
     try:
         return kind.model_validate(fields)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = ".".join(str(part) for part in first["loc"])
+        first = error.errors(include_url=False, include_input=False)[0]
+        place = ".".join(str(part)[:PLACE_LETTERS] for part in first["loc"])
         raise MessageError(f"{kind.name}.{place}: {first['msg']}") from error
+
+
+def _unpacked(data: bytes) -> object:
+    hook = _count_members() if len(data) > MAX_MEMBERS_IN_ALL else None
+    return msgpack.unpackb(
+        data, use_list=False, max_array_len=MAX_MEMBERS, max_map_len=MAX_MEMBERS, object_hook=hook, list_hook=hook
+    )
+
+
+def _count_members() -> Callable[[C], C]:
+    """For each map and tuple that is complete: refuse them once they have too many members altogether."""
+    members = 0
+
+    def count(container: C) -> C:
+        nonlocal members
+        members += 1 + len(container)
+        if members > MAX_MEMBERS_IN_ALL:
+            raise ValueError(f"more than {MAX_MEMBERS_IN_ALL} members")
+        return container
+
+    return count

@@ -10,8 +10,6 @@ from typing import Any, TypeAlias
 import msgpack
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from protocol import messages
@@ -25,16 +23,21 @@ from protocol.messages import (
     JumpHead,
     Keyframe,
     MissionPhase,
+    PhiDigest,
+    PhiPage,
+    ReplicaState,
     Setpoint,
     Status,
     Tick,
     VehicleSample,
 )
-from protocol.wire import MAX_MESSAGE_BYTES, WIRE_VERSION, Message, decode, encode
+from protocol.wire import MAX_MEMBERS, MAX_MESSAGE_BYTES, WIRE_VERSION, Message, decode, encode
 
 Place: TypeAlias = tuple[str | int, ...]
 
-SAMPLE = VehicleSample(drone=2, pose=(0.0, 1.5, 2.0, -0.3, 1.3), velocity=(0.1, -0.5, 0.0, 0.2, -0.1), battery=0.5)
+SAMPLE = VehicleSample(
+    drone=2, pose=(0.0, 1.5, 2.0, -0.3, 1.3), velocity=(0.1, -0.5, 0.0, 0.2, -0.1), battery=0.5, setpoint_tick=-1
+)
 CONTROL = Control(
     tick=41,
     outcome="infeasible",
@@ -60,6 +63,7 @@ ROW = DroneStatus(
     solve_s=1e-4,
     fallbacks=0,
 )
+REPLICA = ReplicaState(tick=40, epoch=5, next_jump=1, missing=0, repaired=2, lost=3)
 EXAMPLES: tuple[Message, ...] = (
     SAMPLE,
     Tick(
@@ -72,7 +76,7 @@ EXAMPLES: tuple[Message, ...] = (
         next_jump=4,
         keyframes=5,
     ),
-    Setpoint(drone=255, tick=12, velocity=(0.5, -0.5, 0.0, 0.5, -0.5)),
+    Setpoint(drone=255, tick=12, velocity=(0.5, -0.5, 0.0, 0.5, -0.5), land=True),
     CONTROL,
     DroneState(
         drone=3,
@@ -81,7 +85,9 @@ EXAMPLES: tuple[Message, ...] = (
         velocity=(0.0, 0.0, 0.5, 0.0, 0.0),
         battery=1.0,
         mode="braking",
+        earlier=((41, (1.5, 2.5, 3.0, 0.5, 1.25)), (40, (1.5, 2.5, 2.5, 0.5, 1.25))),
         importance=0.75,
+        replica=REPLICA,
         control=CONTROL,
     ),
     Keyframe(
@@ -100,9 +106,12 @@ EXAMPLES: tuple[Message, ...] = (
     ),
     Jump(epoch=5, sequence=0, tick=140, increments=np.array([0.0, 0.5, -1.5], np.float32)),
     JumpHead(epoch=5, next_sequence=1, done=139, phase="flying"),
-    JournalPage(epoch=5, next_sequence=2, jumps=(b"\x00one", b"two")),
+    JournalPage(epoch=5, first_sequence=1, next_sequence=2, jumps=(b"\x00one", b"two")),
     MissionPhase(phase="finished", reason="J fällt unter 0,1"),
     ROW,
+    REPLICA,
+    PhiDigest(epoch=5, tick=60, sketches=np.array([[0.5, 1.0], [0.25, 0.0]], np.float32)),
+    PhiPage(epoch=5, tick=61, next_sequence=1, blocks=np.array([3, 7], np.int32), phi=np.ones((4, 3), np.float32)),
     Status(
         phase="flying",
         activity="mapping",
@@ -113,6 +122,10 @@ EXAMPLES: tuple[Message, ...] = (
         f_score_objects=0.125,
         keyframes=3,
         dropped=1,
+        replica=REPLICA,
+        refused=4,
+        unwritten=1,
+        loop_lag_s=0.002,
         keyframes_per_s=2.5,
         jumps=1,
         min_separation_m=1.5,
@@ -213,8 +226,10 @@ def test_a_message_of_another_name_is_refused() -> None:
 
 
 @each_message
-def test_every_field_is_required(message: Message) -> None:
-    for field in type(message).model_fields:
+def test_every_field_without_a_default_is_required(message: Message) -> None:
+    for field, declared in type(message).model_fields.items():
+        if not declared.is_required():
+            continue
         fields = unpacked(message)
         del fields[field]
         with pytest.raises(MessageError, match=rf"{message.name}\.{field}: Field required"):
@@ -279,12 +294,14 @@ def test_bytes_behind_a_message_are_refused() -> None:
         (["<f4", [2], bytes(7)], "7 bytes do not fill shape"),
         (["<f4", [2], bytes(12)], "12 bytes do not fill shape"),
         (["<f8", [2], bytes(8)], "8 bytes do not fill shape"),
-        (["<f4", [2**40, 2**40], b""], "0 bytes do not fill shape"),
+        (["<f4", [2**24, 2**24], b""], "0 bytes do not fill shape"),
+        (["<f4", [2**40, 2**40], b""], "not made of lengths"),
         (["<f4", [-1, -2], bytes(8)], "not made of lengths"),
         (["<f4", [True, 2], bytes(8)], "not made of lengths"),
         (["<f4", [2.0], bytes(8)], "not made of lengths"),
-        (["<f4", [0, 2**64 - 1], b""], ""),
-        (["<f4", [0] * 70, b""], ""),
+        (["<f4", [0, 2**64 - 1], b""], "not made of lengths"),
+        (["<f4", [0, 0, 0, 0, 0], b""], "5 dimensions exceed the limit of 4"),
+        (["<f4", [0] * MAX_MEMBERS, b""], f"{MAX_MEMBERS} dimensions exceed the limit of 4"),
         ([">f4", [2], bytes(8)], "not an array"),
         (["|O", [1], bytes(8)], "not an array"),
         (["<f4", 2, bytes(8)], "not an array"),
@@ -316,64 +333,3 @@ def test_a_message_beyond_the_limit_is_refused_by_sender_and_receiver() -> None:
         encode(frame.model_copy(update={"jpeg": bytes(room + 1)}))
     with pytest.raises(MessageError, match="exceed the limit"):
         decode(Keyframe, encode(largest) + b"\x00")
-
-
-reproducible = settings(max_examples=200, deadline=None, derandomize=True)
-numbers = st.integers(-(2**63), 2**64 - 1) | st.floats() | st.booleans()
-leaves = (
-    st.none()
-    | numbers
-    | st.text(max_size=8)
-    | st.binary(max_size=16)
-    | st.sampled_from(["<f4", "<f8", "<i4", "|u1", "jump", "flying"])
-    | st.builds(msgpack.ExtType, st.integers(0, 127), st.binary(max_size=8))
-    | st.builds(msgpack.Timestamp, st.integers(0, 2**40), st.integers(0, 10**9 - 1))
-)
-structures = st.recursive(
-    leaves,
-    lambda inner: (
-        st.lists(inner, max_size=4)
-        | st.dictionaries(st.text(max_size=8) | st.binary(max_size=4), inner, max_size=4)
-        | st.tuples(st.sampled_from(["<f4", "|u1"]), st.lists(numbers, max_size=4), st.binary(max_size=16))
-    ),
-    max_leaves=12,
-)
-
-
-def decode_or_refuse(kind: type[Message], data: bytes) -> None:
-    try:
-        message = decode(kind, data)
-    except MessageError:
-        return
-    assert_same(decode(kind, encode(message)), message)
-
-
-@reproducible
-@given(data=st.binary(max_size=200), message=st.sampled_from(EXAMPLES))
-def test_arbitrary_bytes_raise_nothing_but_message_errors(data: bytes, message: Message) -> None:
-    decode_or_refuse(type(message), data)
-
-
-@reproducible
-@given(structure=structures, message=st.sampled_from(EXAMPLES))
-def test_arbitrary_structures_raise_nothing_but_message_errors(structure: object, message: Message) -> None:
-    with pytest.raises(MessageError):
-        decode(type(message), msgpack.packb(structure))
-
-
-@reproducible
-@given(data=st.data(), message=st.sampled_from(EXAMPLES))
-def test_a_message_with_anything_in_one_place_raises_nothing_but_message_errors(
-    data: st.DataObject, message: Message
-) -> None:
-    fields = unpacked(message)
-    place, _ = data.draw(st.sampled_from(list(places(fields))))
-    decode_or_refuse(type(message), replaced(fields, place, data.draw(structures)))
-
-
-@reproducible
-@given(data=st.data(), message=st.sampled_from(EXAMPLES))
-def test_a_message_with_a_flipped_bit_raises_nothing_but_message_errors(data: st.DataObject, message: Message) -> None:
-    encoded = bytearray(encode(message))
-    encoded[data.draw(st.integers(0, len(encoded) - 1))] ^= 1 << data.draw(st.integers(0, 7))
-    decode_or_refuse(type(message), bytes(encoded))
