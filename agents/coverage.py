@@ -17,6 +17,9 @@ from protocol.geometry import Floats
 from protocol.importance import SamplingTerms
 from protocol.mission import Mission
 
+DESCENT_WEIGHT = 1e3
+"""How much more a wished descent counts than effort: it is flown to a thousandth."""
+
 
 @dataclass(frozen=True, slots=True)
 class Decision:
@@ -39,6 +42,12 @@ class Planner(Protocol):
         """Own ``pose`` and ``velocity`` (5,); the field's ``terms``; ``cells`` = |V_i|."""
         ...
 
+    def hold(
+        self, pose: Floats, velocity: Floats, neighbours: Sequence[Neighbour], descent_mps: float = 0.0
+    ) -> Decision:
+        """Stay, or come down, as far as the strict rows allow; they may also make the drone give way."""
+        ...
+
 
 class CoverageController:
     """Coverage-Recon's QP-based controller with strict safety rows."""
@@ -52,15 +61,33 @@ class CoverageController:
     def decide(
         self, pose: Floats, velocity: Floats, neighbours: Sequence[Neighbour], terms: SamplingTerms, cells: float
     ) -> Decision:
-        settings, flight = self._mission.controller, self._mission.flight
+        settings = self._mission.controller
         a1, decay = settings.sampling_gain_per_s, self._mission.sensing.decay_per_s
 
         # Sampling row, eqs. (15a) and (15b): keep b = I_i - |V_i| gamma from falling below zero, up to the slack.
         xi1 = decay * terms.gradient
         sampling = decay * terms.first
         xi2 = a1 * (sampling - cells * settings.coverage_rate_per_s) - decay * decay * terms.second
+        return self._filter(pose, velocity, neighbours, xi1, xi2, sampling)
 
-        # Strict rows: never relaxed.
+    def hold(
+        self, pose: Floats, velocity: Floats, neighbours: Sequence[Neighbour], descent_mps: float = 0.0
+    ) -> Decision:
+        """The same program with another wish: xi1 . u + xi2 >= 0 means "fall at ``descent_mps``", or nothing at all."""
+        downwards = np.array([0.0, 0.0, -DESCENT_WEIGHT if descent_mps > 0 else 0.0, 0.0, 0.0])
+        return self._filter(pose, velocity, neighbours, downwards, -DESCENT_WEIGHT * descent_mps, 0.0)
+
+    def _filter(
+        self,
+        pose: Floats,
+        velocity: Floats,
+        neighbours: Sequence[Neighbour],
+        xi1: Floats,
+        xi2: float,
+        sampling: float,
+    ) -> Decision:
+        """The velocity that meets ``xi1 . u + xi2 >= 0`` best; the strict rows are never relaxed."""
+        settings, flight = self._mission.controller, self._mission.flight
         predicted = predicted_pose(pose, velocity, flight)
         rows = self._barriers.rows(predicted, neighbours)
         low, high = self._barriers.velocity_bounds(velocity)

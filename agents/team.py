@@ -20,19 +20,22 @@ class Team:
             drone: (0, start, (0.0,) * 5) for drone, start in starts.items() if drone != own
         }
 
-    def hear(self, state: DroneState) -> None:
-        """An older state never replaces a newer one."""
+    def hear(self, state: DroneState, now: int) -> None:
+        """``now``: this drone's own newest tick. An older state never replaces a newer one, and none is younger than
+        its arrival, give or take the tick that its sender may have heard first: a clock that is ahead must not hide
+        that its drone fell silent."""
         known = self._last_seen.get(state.drone)
         if state.drone != self._own and (known is None or known[0] <= state.tick):
-            self._last_seen[state.drone] = (state.tick, state.pose, state.velocity)
+            self._last_seen[state.drone] = (min(state.tick, now + 1), state.pose, state.velocity)
 
-    def neighbours(self, tick: int) -> list[Neighbour]:
-        """All the others at ``tick``, ascending by id; the longer silent, the larger."""
+    def neighbours(self, tick: int, delay_s: float = 0.0) -> list[Neighbour]:
+        """All the others at ``tick``, ascending by id; the longer silent, the larger, and the longer ``delay_s``, the
+        time until a command is flown: until then either may move on."""
         others = sorted(self._last_seen.items())
         poses = np.array([pose for _, (_, pose, _) in others]).reshape(-1, 5)
         velocities = np.array([velocity for _, (_, _, velocity) in others]).reshape(-1, 5)
         predicted = predicted_pose(poses, velocities, self._flight)
         return [
-            Neighbour(drone, predicted[row, :3], max(0, tick - seen) * self._tick_s)
+            Neighbour(drone, predicted[row, :3], max(0, tick - seen) * self._tick_s + delay_s)
             for row, (drone, (seen, _, _)) in enumerate(others)
         ]

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Callable
 from typing import Protocol
 
 from protocol import topics
 from protocol.bus import Bus
 from protocol.messages import Tick
+
+SIMULATOR_PATIENCE_S = 20.0
+"""A simulator that has been neither heard nor seen for so long is given up; a router's restart takes a few seconds."""
 
 
 class Clock(Protocol):
@@ -19,6 +23,11 @@ class Clock(Protocol):
     @property
     def backlog(self) -> int:
         """Ticks that came since the one returned last: this process is late by so many."""
+        ...
+
+    @property
+    def is_gone(self) -> bool:
+        """Whether no tick is to be expected any more."""
         ...
 
     def now_s(self) -> float:
@@ -33,13 +42,19 @@ class SimulatorClock:
     machine's, so that a simulator that stops is noticed like any vehicle that does.
     """
 
-    def __init__(self, bus: Bus, *, lockstep: bool) -> None:
-        self._bus, self._lockstep = bus, lockstep
+    def __init__(self, bus: Bus, *, lockstep: bool, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._bus, self._lockstep, self._now_s = bus, lockstep, now_s
         self._ticks: deque[Tick] = deque()
+        self._newest = -1
         self._time_s = 0.0
+        self._heard_s: float | None = None
         bus.on(topics.TICK, self._hear)
 
     def _hear(self, tick: Tick) -> None:
+        self._heard_s = self._now_s()
+        if tick.tick <= self._newest:  # said again for those who just came, or late
+            return
+        self._newest = tick.tick
         self._ticks.append(tick)
         self._time_s = tick.time_s
 
@@ -52,5 +67,11 @@ class SimulatorClock:
     def backlog(self) -> int:
         return len(self._ticks)
 
+    @property
+    def is_gone(self) -> bool:
+        if self._heard_s is None or "sim" in self._bus.alive:
+            return False
+        return self._now_s() - self._heard_s > SIMULATOR_PATIENCE_S
+
     def now_s(self) -> float:
-        return self._time_s if self._lockstep else time.monotonic()
+        return self._time_s if self._lockstep else self._now_s()

@@ -8,6 +8,8 @@
     |-- BusError            the transport could not be opened, or is closed
     |   `-- NoReply         a query that nobody answered in time
     |-- JournalError        a journal that cannot be written or read back
+    |   `-- JournalDamaged  ... because what it holds is not what was written
+    |-- StorageError        another file of the run that the disk refuses
     |-- ReconstructionError input that the reconstructor cannot work with
     `-- ProcessError        a process of the run that failed
 
@@ -53,6 +55,14 @@ class NoReply(BusError):
 
 
 class JournalError(CovreconError):
+    pass
+
+
+class JournalDamaged(JournalError):
+    pass
+
+
+class StorageError(CovreconError):
     pass
 
 

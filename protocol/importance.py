@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import math
 from dataclasses import dataclass
@@ -77,6 +78,21 @@ class ImportanceField:
         self._total -= removed
         return SamplingTerms(gradient, first, second)
 
+    def terms(self, poses: Floats, own: int) -> SamplingTerms:
+        """The terms of drone ``own`` with poses (drones, 5), without any decay."""
+        return self.advance(poses, 0.0, own)
+
+    def overwrite(self, rows: NDArray[np.int64], values: NDArray[np.float32]) -> None:
+        """Set phi at the positions ``rows`` (n,) to ``values`` (n, directions), and count J anew."""
+        self.phi[rows] = values
+        self._total = float(self.phi.sum(dtype=np.float64))
+
+    def copy(self) -> ImportanceField:
+        """One that changes by itself; the lattice is shared."""
+        twin = copy.copy(self)
+        twin.phi = self.phi.copy()
+        return twin
+
     def jump(self, increments: NDArray[np.float32]) -> None:
         """Add ``increments`` (positions,), equal for all directions of a position: eq. (4) with delta_2 h2 given."""
         self.phi += increments[:, None]
@@ -97,4 +113,5 @@ def compile_kernels() -> None:
     field = ImportanceField(VirtualField.of(Target(cell_m=1.0, cell_rad=1.0)), Sensing())
     poses = np.array([[0.0, 0.0, 2.0, 0.0, 1.5], [0.5, 0.0, 2.0, 0.0, 1.5]])
     field.advance(poses, 0.05, 0)
+    field.terms(poses, 0)
     field.owned_cells(poses)

@@ -9,13 +9,18 @@ from pydantic import Field
 from protocol.wire import Finite, Message, WireArray
 
 DroneId = Annotated[int, Field(ge=1, le=255)]
-TickNumber = Annotated[int, Field(ge=0)]
+TickNumber = Annotated[int, Field(ge=0, le=2**32 - 1)]
+"""At 20 Hz it lasts for seven years; one that is larger is a fault, and must not make anybody wait or allocate."""
 Count = Annotated[int, Field(ge=0)]
-Vector3 = tuple[Finite, Finite, Finite]
-Vector5 = tuple[Finite, Finite, Finite, Finite, Finite]
+Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
+"""Metres, radians or their rates; more than a thousand kilometres is a fault as well."""
+Vector3 = tuple[Coordinate, Coordinate, Coordinate]
+Vector5 = tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate]
 """x, y, z, camera yaw, camera pitch (depression), or their rates."""
 Outcome = Literal["solved", "infeasible", "out_of_time", "numerical", "none"]
 """What the solver said; anything but "solved" brakes. "none" before the first decision."""
+Mode = Literal["flying", "braking", "joining", "holding", "landing"]
+"""joining: waits for phi; holding and landing: without a ground station for longer than the mission allows."""
 Phase = Literal["starting", "flying", "finished"]
 
 
@@ -27,6 +32,8 @@ class VehicleSample(Message):
     pose: Vector5
     velocity: Vector5
     battery: Annotated[float, Field(ge=0, le=1)]
+    setpoint_tick: Annotated[int, Field(ge=-1)]
+    """Tick of the setpoint that it flies, -1 before the first: how long a command takes is seen from it."""
 
 
 class Tick(Message):
@@ -54,6 +61,8 @@ class Setpoint(Message):
     drone: DroneId
     tick: TickNumber
     velocity: Vector5
+    land: bool = False
+    """Come down here and stay, whatever is commanded later."""
 
 
 class Control(Message):
@@ -81,6 +90,24 @@ class Control(Message):
     """Messages refused so far by this process."""
 
 
+class ReplicaState(Message):
+    """How current one process's phi is, and what it took to keep it equal to the ground station's."""
+
+    name: ClassVar[str] = "replica_state"
+    tick: TickNumber
+    """All earlier ticks are integrated. It lags the state's tick by at most `Replication.wait_s`."""
+    epoch: Count
+    """0 before any jump or page told it."""
+    next_jump: Count
+    """Jumps with a smaller sequence number are applied, or held for their tick."""
+    missing: Count
+    """Blocks whose values are not known: all of them after a late start, until the snapshot is in."""
+    repaired: Count
+    """Blocks that were fetched from the ground station so far because they had drifted."""
+    lost: Count
+    """States of live drones that did not come in time so far."""
+
+
 class DroneState(Message):
     """Published by each agent every tick; the team's states are the log from which phi is integrated."""
 
@@ -90,9 +117,12 @@ class DroneState(Message):
     pose: Vector5
     velocity: Vector5
     battery: Annotated[float, Field(ge=0, le=1)]
-    mode: Literal["flying", "braking"]
+    mode: Mode
+    earlier: Annotated[tuple[tuple[TickNumber, Vector5], ...], Field(max_length=8)] = ()
+    """Ticks and poses of the states just before, repeated so that a lost message loses nothing."""
     importance: Finite
     """J of this replica before the tick is integrated."""
+    replica: ReplicaState
     control: Control | None
     """The decision of the tick before."""
 
@@ -141,12 +171,40 @@ class JumpHead(Message):
 
 
 class JournalPage(Message):
-    """Reply to a range query of ``phi/journal``: encoded jumps in order."""
+    """Reply to a range query of ``phi/journal?from=..;to=..``: encoded jumps in order, as many as fit a page."""
 
     name: ClassVar[str] = "journal_page"
     epoch: Count
+    first_sequence: Count
+    """Older jumps were compacted away: who needs them needs a snapshot."""
     next_sequence: Count
     jumps: tuple[bytes, ...]
+
+
+class PhiDigest(Message):
+    """A sketch of every block of the ground station's phi: replicas that differ fetch those blocks."""
+
+    name: ClassVar[str] = "phi_digest"
+    epoch: Count
+    tick: TickNumber
+    """All earlier ticks, and the jumps due by it, are in."""
+    sketches: WireArray
+    """float32 (blocks, `protocol.blocks.SKETCHES`)."""
+
+
+class PhiPage(Message):
+    """Reply to ``phi/blocks?blocks=3+7;from=120``: some blocks of phi, as many as fit a page."""
+
+    name: ClassVar[str] = "phi_page"
+    epoch: Count
+    tick: TickNumber
+    """All earlier ticks are in, at least the one asked for ..."""
+    next_sequence: Count
+    """... and all jumps below."""
+    blocks: WireArray
+    """int32 (n,), ascending."""
+    phi: WireArray
+    """float32 (positions of these blocks, directions), one block after the other."""
 
 
 class MissionPhase(Message):
@@ -154,7 +212,7 @@ class MissionPhase(Message):
 
     name: ClassVar[str] = "mission_phase"
     phase: Phase
-    reason: str
+    reason: Annotated[str, Field(max_length=1000)]
 
 
 class DroneStatus(Message):
@@ -177,7 +235,7 @@ class Status(Message):
 
     name: ClassVar[str] = "status"
     phase: Phase
-    activity: str
+    activity: Annotated[str, Field(max_length=1000)]
     """What the ground station is doing, in words."""
     tick: TickNumber
     time_s: Finite
@@ -187,6 +245,14 @@ class Status(Message):
     keyframes: Count
     dropped: Count
     """Keyframes that were lost, or refused because the map cannot use them."""
+    replica: ReplicaState
+    """The ground station's own."""
+    refused: Count
+    """Messages that this process refused so far."""
+    unwritten: Count
+    """Records that the disk refused so far, a jump among them: it is kept in memory and tried again."""
+    loop_lag_s: Finite
+    """How late the ground station's event loop wakes, 99th percentile of the last seconds."""
     keyframes_per_s: Finite
     """Per second of wall time."""
     jumps: Count

@@ -219,13 +219,36 @@ class Simulation(Settings):
     to the mission file; empty for a flight without images."""
     image_noise: NonNegative = 2.0
     """Standard deviation of the camera's noise, in grey levels of 255."""
+    start_patience_s: Positive = 120.0
+    """How long the first tick waits for all drones; one that comes later joins in flight."""
 
 
 class Transport(Settings):
     """How the processes reach each other."""
 
     endpoint: str = ""
-    """zenoh endpoint of the ground station's router; empty: a unix socket in the run folder."""
+    """zenoh endpoint of the router; empty: a unix socket in a private folder."""
+
+
+class Replication(Settings):
+    """How phi stays equal in all processes, and what happens without the ground station."""
+
+    wait_s: Positive = 0.5
+    """In real time, how long a tick's integration waits for a state or a jump that is missing; then it is left out.
+    So it bounds the age of every replica's phi."""
+    digest_period_s: Positive = 1.0
+    """Between two digests of the ground station's phi, against which the others compare theirs."""
+    tolerance: Positive = 1e-5
+    """Root mean square difference of a block's cells from which it is fetched: above what float32 rounding of unlike
+    processors adds up to, and a lost state makes about 1e-3."""
+    checkpoint_period_s: Positive = 20.0
+    """Mission time between two checkpoints of the ground station: of map and record, so much a kill -9 may cost."""
+    journal_limit_mb: Positive = 64.0
+    """From this size on, jumps that a checkpoint holds are removed from the journal."""
+    ground_patience_s: Positive = 60.0
+    """How long agents go on covering without the ground station ..."""
+    ground_lost: Literal["hold", "land"] = "hold"
+    """... and what they do then, until it is back."""
 
 
 class Drone(Settings):
@@ -252,6 +275,7 @@ class Mission(Settings):
     reconstruction: Reconstruction = Reconstruction()
     simulation: Simulation = Simulation()
     transport: Transport = Transport()
+    replication: Replication = Replication()
     drones: Annotated[tuple[Drone, ...], Field(min_length=1)]
 
     @property

@@ -120,10 +120,12 @@ def _decay_position(
             tx += weight_t * x[j]
             ty += weight_t * y[j]
             tz += weight_t * z[j]
+    removed = 0.0
+    if rate32 == _ZERO:
+        return float(sum_h), float(sum_hh), float(sum_tc), float(tx), float(ty), float(tz), removed
     for j in range(exponent.size):
         exponent[j] = min(rate32 * h[j], _LIMIT)
     _exp_negative(exponent, bits, powers, h)
-    removed = 0.0
     for j in range(phi.shape[1]):
         after = values[j] * h[j]
         removed += np.float64(values[j]) - np.float64(after)
@@ -190,6 +192,7 @@ def decay_and_terms(
     sigmas: sigma_1, sigma_2, sigma_3. decay: delta_1 in 1/s. dt: seconds.
     Returns (gradient, first, second, removed): gradient (5,) = sum over own cells of (dh1/dp) phi,
     first = sum h1 phi, second = sum h1^2 phi, removed = how much the sum of all phi fell.
+    With ``dt`` = 0 phi is only read, and only what drone ``own`` senses.
     """
     s1, s2, s3 = sigmas
     k1, k2, k3 = 0.5 / (s1 * s1), 0.5 / (s2 * s2), 0.5 / (s3 * s3)
@@ -217,7 +220,10 @@ def decay_and_terms(
     bits, owners = np.empty(padded, np.int32), np.empty(padded, np.int32)
     powers = bits.view(np.float32)
 
+    reads = dt == 0.0
     for i in range(drones):
+        if reads and i != own:
+            continue
         for ix in range(boxes[i, 0], boxes[i, 1]):
             for iy in range(boxes[i, 2], boxes[i, 3]):
                 for iz in range(boxes[i, 4], boxes[i, 5]):
@@ -238,6 +244,7 @@ def decay_and_terms(
                         # itself the line of sight has no direction.
                         if square < nearest or square > farthest or (narrow and along_axis <= 0.0):
                             if k == i:
+                                seen = 0
                                 break
                             continue
                         r = math.sqrt(square)
@@ -246,9 +253,10 @@ def decay_and_terms(
                         exponent = (1.0 - c1) * (1.0 - c1) * k1 + rho * rho * k3
                         if exponent > cut:
                             if k == i:
+                                seen = 0
                                 break
                             continue
-                        if k < i:  # visited with drone k's box
+                        if k < i and not reads:  # visited with drone k's box
                             break
                         base[seen] = exponent
                         sight[seen, 0], sight[seen, 1], sight[seen, 2] = dx / r, dy / r, dz / r

@@ -47,10 +47,15 @@ TICK = Topic("clock/tick", messages.Tick, "sim", "REAL_TIME", 256, 0.5, True, ex
 JUMP = Topic("phi/jump", messages.Jump, "ground", "DATA_HIGH", 256, _NO_AGE, True)
 HEAD = Topic("phi/head", messages.JumpHead, "ground", "INTERACTIVE_LOW", 256, 2.0, True, express=True)
 JOURNAL = Topic("phi/journal", messages.JournalPage, "ground", "BACKGROUND", 16, _NO_AGE, False, queryable=True)
+DIGEST = Topic("phi/digest", messages.PhiDigest, "ground", "INTERACTIVE_LOW", 16, _NO_AGE, True)
+BLOCKS = Topic("phi/blocks", messages.PhiPage, "ground", "BACKGROUND", 16, _NO_AGE, False, queryable=True)
+DRONE_BLOCKS = Topic("drone/{drone}/phi", messages.PhiPage, "agent", "BACKGROUND", 16, _NO_AGE, False, queryable=True)
 PHASE = Topic("command/all", messages.MissionPhase, "ground", "REAL_TIME", 16, 2.0, True, express=True)
 STATUS = Topic("status", messages.Status, "ground", "INTERACTIVE_LOW", 4, 5.0, False)
 
-TOPICS: tuple[Topic[Message], ...] = (STATE, KEYFRAME, SETPOINT, TICK, JUMP, HEAD, JOURNAL, PHASE, STATUS)  # type: ignore[assignment]  # read-only use of an invariant generic
+TOPICS: tuple[Topic[Message], ...] = (  # type: ignore[assignment]  # read-only use of an invariant generic
+    STATE, KEYFRAME, SETPOINT, TICK, JUMP, HEAD, JOURNAL, DIGEST, BLOCKS, DRONE_BLOCKS, PHASE, STATUS,
+)  # fmt: skip
 
 
 def alive_key(role: str) -> str:

@@ -11,6 +11,9 @@ from numba import njit
 from protocol.geometry import Floats
 from protocol.mission import Flight
 
+LANDING_MPS = 0.3
+"""Descent of a vehicle that lands, down to z = 0."""
+
 
 @dataclass(slots=True)
 class VehicleBody:
@@ -20,6 +23,8 @@ class VehicleBody:
     velocity: Floats
     commanded: Floats
     commanded_at_s: float
+    landing: bool = False
+    """Whether it comes down or stands on the ground: commands no longer matter."""
 
     @classmethod
     def at(cls, start: Floats) -> VehicleBody:
@@ -36,7 +41,10 @@ class VehicleBody:
 
         Setpoints older than the time-out are replaced by zero velocity, as an autopilot does.
         """
-        if now_s - self.commanded_at_s > flight.setpoint_timeout_s:
+        if self.landing:
+            rest = self.pose[2] + flight.response_time_s * self.velocity[2]  # where it comes to rest if it brakes now
+            self.commanded = np.array([0.0, 0.0, -min(LANDING_MPS, max(rest, 0.0) / dt), 0.0, 0.0])
+        elif now_s - self.commanded_at_s > flight.setpoint_timeout_s:
             self.commanded = np.zeros(5)
         self.pose, self.velocity = _follow(
             self.pose, self.velocity, self.commanded, flight.acceleration_limits, flight.response_time_s, dt

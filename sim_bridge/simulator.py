@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,13 +28,13 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-START_PATIENCE_S = 120.0
-"""For all processes to import, compile and connect on a slow machine."""
 LOCKSTEP_PATIENCE_S = 60.0
 """An agent that has not answered for so long is flown around: its vehicle brakes, the others go on."""
 GROUND_PATIENCE_S = 120.0
-"""The ground station may be busy reconstructing; only its death or this ends the run."""
+"""How long the world goes on without a ground station that could end the mission, beyond what the mission allows; in
+lockstep, how long it stands still."""
 CHECK_S = 0.5
+"""How often a tick is said again while the world stands still, for whoever has just come."""
 CAMERA_BACKLOG = 64
 """Keyframes that may wait to be rendered in real time; beyond it they are lost and counted."""
 
@@ -42,9 +43,12 @@ class Simulator:
     def __init__(self, mission: Mission, bus: Bus, photographer: Photographer | None, *, lockstep: bool) -> None:
         self._mission, self._bus, self._photographer, self._lockstep = mission, bus, photographer, lockstep
         self._bodies = {drone.id: VehicleBody.at(np.array(drone.start)) for drone in mission.drones}
-        self._answered = dict.fromkeys(self._bodies, -1)
+        self._flown = dict.fromkeys(self._bodies, -1)
         self._silent: set[int] = set()
         self._head = JumpHead(epoch=0, next_sequence=0, done=0, phase="starting")
+        self._tick = 0
+        self._beaten: Tick
+        self._ground_seen_s = 0.0
         self._keyframes = 0
         self._lost_keyframes = 0
         self._camera = ThreadPoolExecutor(1, thread_name_prefix="camera")
@@ -54,12 +58,14 @@ class Simulator:
         bus.watch_lives()
 
     def _hear_setpoint(self, setpoint: Setpoint) -> None:
+        """An older one never replaces a newer one, and none is younger than its arrival."""
         body = self._bodies.get(setpoint.drone)
-        if body is None:
+        if body is None or setpoint.tick < self._flown[setpoint.drone]:
             return
-        time_s = setpoint.tick * self._mission.tick_s
-        body.command(np.array(setpoint.velocity), time_s, self._mission.flight)
-        self._answered[setpoint.drone] = max(self._answered[setpoint.drone], setpoint.tick)
+        tick = min(setpoint.tick, self._tick)
+        body.command(np.array(setpoint.velocity), tick * self._mission.tick_s, self._mission.flight)
+        body.landing = body.landing or setpoint.land
+        self._flown[setpoint.drone] = tick
         self._silent.discard(setpoint.drone)
 
     def _hear_head(self, head: JumpHead) -> None:
@@ -69,35 +75,40 @@ class Simulator:
         """Until the ground station says that the mission is finished.
 
         Raises:
-            ProcessError: somebody did not appear, or the ground station died.
+            ProcessError: nobody appeared, or the ground station stayed away.
         """
         self._bus.announce("sim")
         await self._wait_for_everybody()
         loop = asyncio.get_running_loop()
-        began, tick = loop.time(), 0
+        began = loop.time()
         try:
             while self._head.phase != "finished":
-                self._publish(tick)
-                await self._photograph(tick)
+                self._publish(self._beat())
+                await self._photograph(self._tick)
                 if self._lockstep:
-                    await self._wait_for_agents(tick)
-                    await self._wait_for_ground(tick + 1)
+                    await self._wait_for_agents()
+                    await self._wait_for_ground()
                 else:
-                    await asyncio.sleep(max(0.0, began + (tick + 1) * self._mission.tick_s - loop.time()))
-                    self._require_ground()
+                    await asyncio.sleep(max(0.0, began + (self._tick + 1) * self._mission.tick_s - loop.time()))
+                    self._require_ground(self._mission.replication.ground_patience_s + GROUND_PATIENCE_S)
                 for body in self._bodies.values():
-                    body.step(self._mission.tick_s, tick * self._mission.tick_s, self._mission.flight)
-                tick += 1
+                    body.step(self._mission.tick_s, self._tick * self._mission.tick_s, self._mission.flight)
+                self._tick += 1
         finally:
             self._camera.shutdown(cancel_futures=True)
         if self._lost_keyframes:
             log.warning("%d keyframes were due faster than they could be rendered and are lost", self._lost_keyframes)
 
     async def _wait_for_everybody(self) -> None:
+        """For as long as the mission allows; a drone that comes later joins in flight."""
+        patience_s = self._mission.simulation.start_patience_s
         wanted = {"ground", *(f"drone/{drone}" for drone in self._bodies)}
-        if not await self._bus.until(lambda: wanted <= self._bus.alive, START_PATIENCE_S):
-            missing = ", ".join(sorted(wanted - self._bus.alive))
-            raise ProcessError(f"not started within {START_PATIENCE_S:g} s: {missing}")
+        if await self._bus.until(lambda: wanted <= self._bus.alive, patience_s):
+            return
+        missing = ", ".join(sorted(wanted - self._bus.alive))
+        if "ground" not in self._bus.alive or not self._live():
+            raise ProcessError(f"not started within {patience_s:g} s: {missing}")
+        log.error("not started within %g s: %s: going on without", patience_s, missing)
 
     def _live(self) -> list[int]:
         return [drone for drone in sorted(self._bodies) if self._is_live(drone)]
@@ -105,19 +116,23 @@ class Simulator:
     def _is_live(self, drone: int) -> bool:
         return drone not in self._silent and f"drone/{drone}" in self._bus.alive
 
-    def _publish(self, tick: int) -> None:
+    def _beat(self) -> Tick:
         if not self._lockstep:
-            oldest = tick - topics.SETPOINT.max_age_s / self._mission.tick_s
-            self._silent = {drone for drone, answered in self._answered.items() if answered < oldest}
+            oldest = self._tick - topics.SETPOINT.max_age_s / self._mission.tick_s
+            self._silent = {drone for drone, flown in self._flown.items() if flown < oldest}
         vehicles = [
             VehicleSample(
-                drone=drone, pose=tuple(body.pose.tolist()), velocity=tuple(body.velocity.tolist()), battery=1.0
+                drone=drone,
+                pose=tuple(body.pose.tolist()),
+                velocity=tuple(body.velocity.tolist()),
+                battery=1.0,
+                setpoint_tick=self._flown[drone],
             )
             for drone, body in sorted(self._bodies.items())
         ]
-        beat = Tick(
-            tick=tick,
-            time_s=tick * self._mission.tick_s,
+        return Tick(
+            tick=self._tick,
+            time_s=self._tick * self._mission.tick_s,
             lockstep=self._lockstep,
             live=tuple(self._live()),
             vehicles=tuple(vehicles),
@@ -125,7 +140,19 @@ class Simulator:
             next_jump=self._head.next_sequence,
             keyframes=self._keyframes,
         )
+
+    def _publish(self, beat: Tick) -> None:
+        self._beaten = beat
         self._bus.put(topics.TICK, beat)
+
+    async def _stand_still(self, condition: Callable[[], bool], patience_s: float) -> bool:
+        """Wait for ``condition``, saying the tick again for whoever comes meanwhile."""
+        deadline = asyncio.get_running_loop().time() + patience_s
+        while not await self._bus.until(condition, CHECK_S):
+            if asyncio.get_running_loop().time() > deadline:
+                return False
+            self._publish(self._beaten)
+        return True
 
     async def _photograph(self, tick: int) -> None:
         if self._photographer is None:
@@ -144,32 +171,38 @@ class Simulator:
             task.add_done_callback(self._rendering.discard)
 
     async def _shoot(self, photographer: Photographer, shot: Shot) -> None:
-        keyframe = await asyncio.get_running_loop().run_in_executor(self._camera, photographer.take, shot)
-        self._bus.put(topics.KEYFRAME, keyframe, shot.drone)
+        def shoot() -> None:  # also sends, which may take long on a congested link
+            self._bus.put(topics.KEYFRAME, photographer.take(shot), shot.drone)
+
+        await asyncio.get_running_loop().run_in_executor(self._camera, shoot)
         self._keyframes += 1
 
-    async def _wait_for_agents(self, tick: int) -> None:
-        def answered() -> bool:
-            return all(last >= tick or not self._is_live(drone) for drone, last in self._answered.items())
+    async def _wait_for_agents(self) -> None:
+        tick = self._tick
 
-        if not await self._bus.until(answered, LOCKSTEP_PATIENCE_S):
-            late = {drone for drone in self._live() if self._answered[drone] < tick}
+        def answered() -> bool:
+            return all(flown >= tick or not self._is_live(drone) for drone, flown in self._flown.items())
+
+        if not await self._stand_still(answered, LOCKSTEP_PATIENCE_S):
+            late = {drone for drone in self._live() if self._flown[drone] < tick}
             log.error("tick %d: no answer from drones %s: going on without them", tick, sorted(late))
             self._silent |= late
         if not self._live():
             raise ProcessError(f"tick {tick}: no drone answers")
 
-    async def _wait_for_ground(self, tick: int) -> None:
-        for _ in range(int(GROUND_PATIENCE_S / CHECK_S)):
-            done = await self._bus.until(lambda: self._head.done >= tick or self._head.phase == "finished", CHECK_S)
-            if done:
-                return
-            self._require_ground()
-        raise ProcessError(f"tick {tick}: the ground station is not done after {GROUND_PATIENCE_S:g} s")
+    async def _wait_for_ground(self) -> None:
+        def done() -> bool:
+            return self._head.done > self._tick or self._head.phase == "finished"
 
-    def _require_ground(self) -> None:
-        if "ground" not in self._bus.alive and self._head.phase != "finished":
-            raise ProcessError("the ground station is gone")
+        if not await self._stand_still(done, GROUND_PATIENCE_S):
+            raise ProcessError(f"tick {self._tick}: the ground station is not done after {GROUND_PATIENCE_S:g} s")
+
+    def _require_ground(self, patience_s: float) -> None:
+        now_s = asyncio.get_running_loop().time()
+        if "ground" in self._bus.alive:
+            self._ground_seen_s = now_s
+        elif now_s - self._ground_seen_s > patience_s:
+            raise ProcessError(f"the ground station has been gone for {patience_s:g} s")
 
 
 async def run_simulator(mission: Mission, endpoint: str, run: Path, *, lockstep: bool) -> None:

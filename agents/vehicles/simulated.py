@@ -13,33 +13,49 @@ from protocol.mission import Flight
 
 
 class SimulatedVehicle:
-    def __init__(self, bus: Bus, drone: int, flight: Flight) -> None:
-        self._bus, self._drone = bus, drone
+    def __init__(self, bus: Bus, drone: int, flight: Flight, tick_s: float) -> None:
+        self._bus, self._drone, self._tick_s = bus, drone, tick_s
         self._limit = np.array(flight.velocity_limits)
         self._telemetry: Telemetry | None = None
         self._tick = 0
+        self._first_sent: int | None = None
         bus.on(topics.TICK, self._hear)
 
     def _hear(self, tick: Tick) -> None:
         for sample in tick.vehicles:
             if sample.drone == self._drone:
                 self._telemetry = Telemetry(
-                    np.array(sample.pose), np.array(sample.velocity), sample.battery, tick.time_s
+                    np.array(sample.pose),
+                    np.array(sample.velocity),
+                    sample.battery,
+                    tick.time_s,
+                    self._delay_s(tick.tick, sample.setpoint_tick),
                 )
                 self._tick = tick.tick
+
+    def _delay_s(self, tick: int, flown: int) -> float:
+        """``flown``: tick of the setpoint in effect; those of an agent that flew this vehicle before do not count."""
+        if self._first_sent is None:
+            return 0.0
+        return max(0, tick - 1 - max(flown, self._first_sent - 1)) * self._tick_s
 
     def telemetry(self) -> Telemetry | None:
         return self._telemetry
 
     def send(self, tick: int, velocity: Floats) -> Floats:
         sent = np.clip(velocity, -self._limit, self._limit)
-        self._bus.put(
-            topics.SETPOINT, Setpoint(drone=self._drone, tick=tick, velocity=tuple(sent.tolist())), self._drone
-        )
+        if self._first_sent is None:
+            self._first_sent = tick
+        setpoint = Setpoint(drone=self._drone, tick=tick, velocity=tuple(sent.tolist()))
+        self._bus.put(topics.SETPOINT, setpoint, self._drone)
         return sent
 
     def stop(self) -> None:
         self.send(self._tick, np.zeros(5))
+
+    def land(self) -> None:
+        setpoint = Setpoint(drone=self._drone, tick=self._tick, velocity=(0.0,) * 5, land=True)
+        self._bus.put(topics.SETPOINT, setpoint, self._drone)
 
     def close(self) -> None:
         """Nothing to release: the bus belongs to the agent."""

@@ -18,6 +18,8 @@ class Telemetry:
     """Share left, 0 to 1."""
     stamp_s: float
     """Mission time at which it was true."""
+    delay_s: float = 0.0
+    """How much longer than one tick it takes until a command is flown."""
 
 
 class Vehicle(Protocol):
@@ -33,6 +35,10 @@ class Vehicle(Protocol):
 
     def stop(self) -> None:
         """Zero velocity now, whatever was sent before."""
+        ...
+
+    def land(self) -> None:
+        """Come down here and stay on the ground, whatever is sent later; may be called again."""
         ...
 
     def close(self) -> None: ...

@@ -211,3 +211,26 @@ def test_the_sampling_row_is_the_barrier_condition_of_the_drones_own_share_of_th
         rate = (share(step, velocity) - share(-step, velocity)) / (2 * step)
         expected = rate + A1 * (share(0.0, STILL) - CELLS * GAMMA)
         assert float(xi1 @ velocity) + xi2 == pytest.approx(expected, rel=1e-4, abs=1e-4 * np.abs(xi1).sum())
+
+
+def test_without_a_wish_a_drone_stays_where_it_is() -> None:
+    decision = CoverageController(MISSION, neighbours=1).hold(POSE, STILL, [beside(2, 2.0, 0.0, 0.0)])
+
+    assert decision.outcome == "solved"
+    assert np.abs(decision.velocity).max() < 1e-4
+
+
+def test_a_drone_that_holds_gives_way_to_one_that_is_too_near() -> None:
+    decision = CoverageController(MISSION, neighbours=1).hold(POSE, STILL, [beside(2, 0.9, 0.0, 0.0)])
+
+    assert decision.velocity[0] < 0, "away from it"
+
+
+def test_a_wished_descent_is_flown_as_far_as_the_strict_rows_allow() -> None:
+    controller = CoverageController(MISSION, neighbours=1)
+    free = controller.hold(POSE, STILL, [beside(2, 2.0, 0.0, 0.0)], descent_mps=0.3)
+    blocked = controller.hold(POSE, STILL, [beside(2, 0.0, 0.0, -1.1)], descent_mps=0.3)
+
+    assert free.velocity[2] == pytest.approx(-0.3, rel=0.01)
+    assert np.abs(free.velocity[:2]).max() < 0.01
+    assert blocked.velocity[2] > -0.15

@@ -145,3 +145,19 @@ def test_yaw_wraps_at_half_a_turn_and_nothing_else_jumps(yaw: float, rate: float
     assert abs(turned) > math.pi
     assert math.remainder(turned - flown.pose[3], 2 * math.pi) == pytest.approx(0.0, abs=1e-12)
     assert flown.pose[[0, 1, 2, 4]].tolist() == [0.0, 0.0, 2.0, 1.3]
+
+
+def test_a_vehicle_that_lands_comes_down_whatever_is_commanded_and_stays_on_the_ground() -> None:
+    flown = body(command=np.array([0.5, 0.5, 0.5, 0.0, 0.0]))
+    flown.landing = True
+    lowest, path = 9.0, []
+    for tick in range(400):
+        flown.command(np.array([0.5, 0.5, 0.5, 0.0, 0.0]), tick * DT, FLIGHT)
+        flown.step(DT, tick * DT, FLIGHT)
+        lowest = min(lowest, float(flown.pose[2]))
+        path.append(flown.pose[:2].copy())
+
+    assert flown.pose[2] == pytest.approx(0.0, abs=0.03)
+    assert lowest > -0.02
+    assert path[-1] == pytest.approx(path[0]), "straight down"
+    assert np.abs(flown.velocity).max() < 1e-3

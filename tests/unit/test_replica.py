@@ -70,7 +70,7 @@ def test_reordered_repeated_and_lost_jumps_end_in_the_same_bytes_at_every_tick(a
             if when == tick:
                 replicated.hear(JUMPS[sequence])
         due = sum(each.tick <= tick for each in JUMPS)
-        for sequence in range(replicated.next_sequence, due):
+        for sequence in range(replicated.jumps.next_sequence, due):
             replicated.hear(JUMPS[sequence])
         replicated.advance(tick, poses_at(tick), TICK_S)
         digests.append(replicated.field.sha256)
@@ -108,19 +108,19 @@ def test_a_jump_that_comes_after_its_tick_takes_effect_at_once() -> None:
 
 def test_a_gap_is_told_until_it_is_filled() -> None:
     waiting = replica()
-    assert waiting.gap is None
+    assert waiting.jumps.gap is None
     waiting.hear(JUMPS[0])
-    assert waiting.gap is None
+    assert waiting.jumps.gap is None
     waiting.hear(JUMPS[5])
     waiting.hear(JUMPS[3])
-    assert waiting.gap == (1, 3)
+    assert waiting.jumps.gap == (1, 3)
     waiting.hear(JUMPS[1])
-    assert waiting.gap == (2, 3)
+    assert waiting.jumps.gap == (2, 3)
     waiting.hear(JUMPS[2])
-    assert waiting.gap == (4, 5)
+    assert waiting.jumps.gap == (4, 5)
     waiting.hear(JUMPS[4])
-    assert waiting.gap is None
-    assert waiting.next_sequence == 6
+    assert waiting.jumps.gap is None
+    assert waiting.jumps.next_sequence == 6
 
 
 def test_a_jump_behind_a_gap_is_not_applied_also_when_it_is_due() -> None:
@@ -137,12 +137,12 @@ def test_a_jump_behind_a_gap_is_not_applied_also_when_it_is_due() -> None:
 def test_a_jump_of_another_epoch_is_refused_and_counted() -> None:
     known = replica(EPOCH)
     known.hear(jump(0, tick=0, epoch=EPOCH + 1))
-    assert (known.refused, known.next_sequence, known.gap) == (1, 0, None)
+    assert (known.refused, known.jumps.next_sequence, known.jumps.gap) == (1, 0, None)
 
     learns = replica()
     learns.hear(JUMPS[0])
     learns.hear(jump(1, tick=0, epoch=EPOCH + 1))
-    assert (learns.epoch, learns.refused, learns.next_sequence) == (EPOCH, 1, 1)
+    assert (learns.jumps.epoch, learns.refused, learns.jumps.next_sequence) == (EPOCH, 1, 1)
 
 
 @pytest.mark.parametrize(
@@ -163,6 +163,6 @@ def test_increments_that_do_not_fit_the_field_are_refused_and_decide_nothing(inc
 
     assert fresh.refused == 1
     assert (fresh.field.phi == 1).all()
-    assert fresh.epoch == 0, "a message that is refused must not tell the epoch"
+    assert fresh.jumps.epoch == 0, "a message that is refused must not tell the epoch"
     fresh.hear(JUMPS[0])
-    assert fresh.next_sequence == 1
+    assert fresh.jumps.next_sequence == 1

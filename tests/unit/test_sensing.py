@@ -137,3 +137,21 @@ def test_a_drone_that_sees_no_cell_changes_nothing() -> None:
     assert (importance.phi == 1).all()
     assert terms.first == 0.0
     assert not terms.gradient.any()
+
+
+def test_reading_the_terms_changes_nothing_and_gives_what_a_decay_would_have_given() -> None:
+    """Also for a drone whose cells others contest."""
+    poses = np.array([[0.0, 0.0, 1.9, 0.0, 1.4], [0.3, 0.1, 2.0, 0.5, 1.3], [-0.2, 0.3, 1.8, 2.0, 1.5]])
+    for own in range(3):
+        field = ImportanceField(VirtualField.of(Target(cell_m=0.4, cell_rad=0.5)), Sensing())
+        field.advance(poses[::-1], 0.5, 0)
+        before = field.phi.tobytes()
+        read = field.terms(poses, own)
+        assert field.phi.tobytes() == before
+        importance = field.importance
+        decayed = field.advance(poses, 0.05, own)
+
+        assert field.importance < importance
+        assert read.gradient == pytest.approx(decayed.gradient, rel=1e-6)
+        assert (read.first, read.second) == pytest.approx((decayed.first, decayed.second), rel=1e-6)
+        assert read.first > 0

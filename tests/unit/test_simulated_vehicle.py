@@ -14,7 +14,7 @@ import pytest
 from agents.vehicles.simulated import SimulatedVehicle
 from protocol import topics
 from protocol.bus import Bus
-from protocol.clock import SimulatorClock
+from protocol.clock import SIMULATOR_PATIENCE_S, SimulatorClock
 from protocol.messages import Setpoint, Tick, VehicleSample
 from protocol.mission import Flight
 from protocol.topics import Topic
@@ -28,6 +28,7 @@ class NotingBus:
 
     put_by: list[tuple[str, Setpoint, str]] = field(default_factory=list)
     handlers: list[Callable[[Tick], None]] = field(default_factory=list)
+    alive: set[str] = field(default_factory=set)
 
     def on(self, topic: Topic[Any], handler: Callable[[Tick], None]) -> None:
         assert topic is topics.TICK
@@ -39,15 +40,19 @@ class NotingBus:
     async def until(self, condition: Callable[[], bool], _timeout_s: float) -> bool:
         return condition()
 
-    def beat(self, number: int) -> None:
+    def beat(self, number: int, flown: int = -1) -> None:
         for handler in self.handlers:
-            handler(tick(number))
+            handler(tick(number, flown))
 
 
-def tick(number: int) -> Tick:
+def tick(number: int, flown: int = -1) -> Tick:
     samples = [
         VehicleSample(
-            drone=drone, pose=(drone, number, 2.0, 0.0, 1.3), velocity=(0.1 * drone, 0.0, 0.0, 0.0, 0.0), battery=0.5
+            drone=drone,
+            pose=(drone, number, 2.0, 0.0, 1.3),
+            velocity=(0.1 * drone, 0.0, 0.0, 0.0, 0.0),
+            battery=0.5,
+            setpoint_tick=flown,
         )
         for drone in (1, 2)
     ]
@@ -70,7 +75,7 @@ def bus() -> NotingBus:
 
 @pytest.fixture
 def vehicle(bus: NotingBus) -> SimulatedVehicle:
-    return SimulatedVehicle(cast("Bus", bus), 2, FLIGHT)
+    return SimulatedVehicle(cast("Bus", bus), 2, FLIGHT, 0.05)
 
 
 def test_there_is_no_telemetry_before_the_first_tick(vehicle: SimulatedVehicle) -> None:
@@ -96,6 +101,38 @@ def test_what_is_sent_is_clipped_and_told(bus: NotingBus, vehicle: SimulatedVehi
     ((key, setpoint, _),) = bus.put_by
     assert key == "drone/2/setpoint"
     assert (setpoint.tick, setpoint.velocity) == (7, tuple(sent.tolist()))
+
+
+@pytest.mark.parametrize(("flown", "delay_s"), [(9, 0.0), (8, 0.05), (3, 0.3)])
+def test_telemetry_tells_how_long_a_command_takes_beyond_a_tick(
+    bus: NotingBus, vehicle: SimulatedVehicle, flown: int, delay_s: float
+) -> None:
+    vehicle.send(1, np.zeros(5))
+    bus.beat(10, flown)
+
+    telemetry = vehicle.telemetry()
+    assert telemetry is not None
+    assert telemetry.delay_s == pytest.approx(delay_s)
+
+
+def test_commands_of_an_agent_that_flew_the_vehicle_before_tell_no_delay(
+    bus: NotingBus, vehicle: SimulatedVehicle
+) -> None:
+    bus.beat(100, flown=20)
+    vehicle.send(100, np.zeros(5))
+    bus.beat(102, flown=20)
+
+    telemetry = vehicle.telemetry()
+    assert telemetry is not None
+    assert telemetry.delay_s == pytest.approx(0.1), "its own first command takes two ticks already"
+
+
+def test_landing_is_told_with_the_newest_tick(bus: NotingBus, vehicle: SimulatedVehicle) -> None:
+    bus.beat(9)
+    vehicle.land()
+
+    ((_, setpoint, _),) = bus.put_by
+    assert (setpoint.tick, setpoint.land, setpoint.velocity) == (9, True, (0.0,) * 5)
 
 
 def test_any_thread_may_stop_the_vehicle(bus: NotingBus, vehicle: SimulatedVehicle) -> None:
@@ -127,6 +164,28 @@ async def test_the_clock_gives_ticks_in_order_and_tells_how_many_wait(bus: Notin
     assert clock.backlog == 2
     assert [(await clock.next_tick(0.0)).tick for _ in range(2)] == [1, 2]  # type: ignore[union-attr]
     assert clock.backlog == 0
+
+
+async def test_a_tick_that_is_said_again_or_late_counts_once(bus: NotingBus) -> None:
+    clock = SimulatorClock(cast("Bus", bus), lockstep=True)
+    for number in (0, 1, 1, 3, 2, 3):
+        bus.beat(number)
+
+    assert [(await clock.next_tick(0.0)).tick for _ in range(3)] == [0, 1, 3]  # type: ignore[union-attr]
+    assert clock.backlog == 0
+
+
+def test_a_simulator_is_given_up_when_it_is_neither_heard_nor_seen_for_long(bus: NotingBus) -> None:
+    now_s = 100.0
+    clock = SimulatorClock(cast("Bus", bus), lockstep=False, now_s=lambda: now_s)
+    assert not clock.is_gone, "not before it was there"
+    bus.beat(0)
+    now_s += SIMULATOR_PATIENCE_S
+    assert not clock.is_gone
+    now_s += 0.1
+    assert clock.is_gone
+    bus.alive.add("sim")
+    assert not clock.is_gone
 
 
 async def test_in_lockstep_time_is_the_missions_and_stands_still_between_ticks(bus: NotingBus) -> None:

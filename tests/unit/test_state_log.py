@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from protocol.messages import DroneState
+from protocol.messages import DroneState, ReplicaState
 from protocol.state_log import HISTORY_TICKS, StateLog
 
 
@@ -15,6 +15,7 @@ def state(drone: int, tick: int) -> DroneState:
         battery=1.0,
         mode="flying",
         importance=1.0,
+        replica=ReplicaState(tick=0, epoch=0, next_jump=0, missing=0, repaired=0, lost=0),
         control=None,
     )
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from agents.team import Team
-from protocol.messages import DroneState
+from protocol.messages import DroneState, ReplicaState
 from protocol.mission import Flight
 
 FLIGHT = Flight(response_time_s=0.2)
@@ -28,6 +28,7 @@ def state(drone: int, tick: int, x: float, speed: float = 0.0) -> DroneState:
         battery=1.0,
         mode="flying",
         importance=1.0,
+        replica=ReplicaState(tick=0, epoch=0, next_jump=0, missing=0, repaired=0, lost=0),
         control=None,
     )
 
@@ -42,14 +43,14 @@ def test_a_drone_that_never_spoke_is_an_obstacle_at_its_start_that_grows() -> No
 
 def test_a_drone_is_no_obstacle_to_itself() -> None:
     own = team()
-    own.hear(state(2, 3, 9.0))
+    own.hear(state(2, 3, 9.0), now=3)
 
     assert [neighbour.drone for neighbour in own.neighbours(3)] == [1, 5]
 
 
 def test_a_neighbour_is_where_it_will_come_to_rest() -> None:
     known = team()
-    known.hear(state(1, 8, x=3.0, speed=0.5))
+    known.hear(state(1, 8, x=3.0, speed=0.5), now=8)
 
     first = known.neighbours(8)[0]
 
@@ -59,15 +60,15 @@ def test_a_neighbour_is_where_it_will_come_to_rest() -> None:
 
 def test_a_silent_neighbour_ages_by_the_ticks_since_its_last_state() -> None:
     known = team()
-    known.hear(state(5, 8, x=3.0))
+    known.hear(state(5, 8, x=3.0), now=8)
 
     assert [neighbour.age_s for neighbour in known.neighbours(28)] == pytest.approx([1.4, 1.0])
 
 
 def test_an_older_state_never_replaces_a_newer_one() -> None:
     known = team()
-    known.hear(state(1, 8, x=3.0))
-    known.hear(state(1, 7, x=-3.0))
+    known.hear(state(1, 8, x=3.0), now=9)
+    known.hear(state(1, 7, x=-3.0), now=9)
 
     assert known.neighbours(9)[0].position[0] == 3.0
     assert known.neighbours(9)[0].age_s == pytest.approx(TICK_S)
@@ -75,13 +76,38 @@ def test_an_older_state_never_replaces_a_newer_one() -> None:
 
 def test_a_state_ahead_of_the_tick_at_hand_has_no_age() -> None:
     known = team()
-    known.hear(state(1, 12, x=3.0))
+    known.hear(state(1, 12, x=3.0), now=10)
 
     assert known.neighbours(10)[0].age_s == 0.0
 
 
+def test_a_clock_that_is_ahead_does_not_hide_that_its_drone_fell_silent() -> None:
+    known = team()
+    known.hear(state(1, 60, x=3.0), now=10)
+
+    assert known.neighbours(50)[0].age_s == pytest.approx(1.95), "from the tick after its arrival"
+    known.hear(state(1, 61, x=2.0), now=51)
+    assert known.neighbours(51)[0].age_s == 0.0
+    assert known.neighbours(51)[0].position[0] == 2.0
+
+
+def test_a_state_that_comes_before_its_own_tick_has_no_age_at_that_tick() -> None:
+    """Or two runs in lockstep would differ by which message came first."""
+    known = team()
+    known.hear(state(1, 8, x=3.0), now=7)
+
+    assert known.neighbours(8)[0].age_s == 0.0
+
+
+def test_the_time_until_a_command_is_flown_makes_all_neighbours_larger() -> None:
+    known = team()
+    known.hear(state(1, 8, x=3.0), now=8)
+
+    assert [neighbour.age_s for neighbour in known.neighbours(8, delay_s=0.3)] == pytest.approx([0.3, 0.7])
+
+
 def test_a_stranger_that_is_heard_of_becomes_an_obstacle_and_stays_one() -> None:
     known = team()
-    known.hear(state(3, 8, x=3.0))
+    known.hear(state(3, 8, x=3.0), now=8)
 
     assert [neighbour.drone for neighbour in known.neighbours(100)] == [1, 3, 5]

@@ -1,0 +1,77 @@
+"""Sketches tell replicas apart: whatever differs, by how much, and where."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from protocol.blocks import BLOCK_POSITIONS, PAGE_BYTES, SKETCHES, BlockLayout
+
+POSITIONS, DIRECTIONS = 3 * BLOCK_POSITIONS + 10, 42
+LAYOUT = BlockLayout((POSITIONS, DIRECTIONS))
+TOLERANCE = 1e-5
+
+
+def field() -> np.ndarray:
+    return np.random.default_rng(1).uniform(0, 2, (POSITIONS, DIRECTIONS)).astype(np.float32)
+
+
+def test_blocks_cover_every_position_once() -> None:
+    rows = LAYOUT.rows_of(np.arange(LAYOUT.count, dtype=np.int32))
+
+    assert rows.tolist() == list(range(POSITIONS))
+    assert LAYOUT.rows_of(np.array([3], np.int32)).size == 10
+    assert LAYOUT.rows_of(np.empty(0, np.int32)).size == 0
+
+
+def test_equal_fields_have_equal_sketches() -> None:
+    assert LAYOUT.sketch(field()).shape == (LAYOUT.count, SKETCHES)
+    assert LAYOUT.differing(LAYOUT.sketch(field()), LAYOUT.sketch(field()), 0.0) == []
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(position=st.integers(0, POSITIONS - 1), direction=st.integers(0, DIRECTIONS - 1))
+def test_a_single_cell_that_differs_is_found_wherever_it_is(position: int, direction: int) -> None:
+    phi = field()
+    phi[position, direction] += np.float32(0.01)
+
+    assert LAYOUT.differing(LAYOUT.sketch(phi), LAYOUT.sketch(field()), TOLERANCE) == [position // BLOCK_POSITIONS]
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 10_000))
+def test_differences_that_cancel_in_the_mean_are_found(seed: int) -> None:
+    """Random ones of 1e-3 root mean square with zero mean: 100 times the tolerance."""
+    other = field()
+    change = np.random.default_rng(seed).normal(0, 1e-3, (BLOCK_POSITIONS, DIRECTIONS))
+    other[:BLOCK_POSITIONS] += (change - change.mean()).astype(np.float32)
+
+    assert LAYOUT.differing(LAYOUT.sketch(other), LAYOUT.sketch(field()), TOLERANCE) == [0]
+
+
+def test_the_projections_estimate_the_root_mean_square_difference() -> None:
+    squares = []
+    for seed in range(200):
+        other = field()
+        other += np.random.default_rng(seed).normal(0, 1e-2, other.shape).astype(np.float32)
+        apart = LAYOUT.sketch(other).astype(float) - LAYOUT.sketch(field())
+        squares.append((apart[:, 1:] ** 2).mean())
+
+    assert np.sqrt(np.mean(squares)) == pytest.approx(1e-2, rel=0.1)
+
+
+def test_rounding_alone_is_below_the_tolerance() -> None:
+    """What another processor's float32 arithmetic adds up to: an error of 1e-6 in every cell."""
+    other = field() * (1 + np.random.default_rng(3).normal(0, 1e-6, (POSITIONS, DIRECTIONS))).astype(np.float32)
+
+    assert LAYOUT.differing(LAYOUT.sketch(other), LAYOUT.sketch(field()), TOLERANCE) == []
+
+
+@pytest.mark.parametrize("directions", [42, 208, 5000])
+def test_a_page_holds_what_fits_and_at_least_one_block(directions: int) -> None:
+    blocks = BlockLayout((1000, directions)).blocks_a_page()
+
+    assert blocks >= 1
+    assert blocks == 1 or blocks * BLOCK_POSITIONS * directions * 4 <= PAGE_BYTES
