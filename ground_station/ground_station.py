@@ -1,289 +1,196 @@
 """The ground station's process: keeps phi with the team, turns keyframes into a map, and sends drones back by jumps.
 
-The event loop never waits for the map: a worker thread owns it (`ground_station.mapper`), and a jump takes effect a
-fixed delay after the tick of its map, in every process alike. In lockstep the simulator waits for "done up to k", so
-the same mission gives the same jumps at the same ticks however fast the machine is.
+The shell around the parts that do so: it hears, steps with the clock, and says how far it is. Neither the map nor a
+drone that is late holds up its event loop (`ground_station.map_feedback`, `protocol.replication`).
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
-import math
-from collections import deque
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
-from ground_station.evaluation import Scores
-from ground_station.feedback import FeedbackSchedule
-from ground_station.journal import Journal
+from ground_station.journal import JOURNAL_FILE, Journal, open_journal
+from ground_station.jump_publisher import JumpPublisher
+from ground_station.keyframe_log import KEYFRAMES_FILE, KeyframeLog
+from ground_station.map_feedback import MapFeedback
 from ground_station.mapper import Mapper, MapUpdate
+from ground_station.recovery import Recovery
 from ground_station.rehearsal import rehearse
 from ground_station.results import Metrics, RunFolder
 from ground_station.status import StatusBoard
 from protocol import topics
 from protocol.bus import Bus, connect
 from protocol.clock import SimulatorClock
-from protocol.errors import MessageError
 from protocol.field import VirtualField
-from protocol.importance import ImportanceField, compile_kernels
-from protocol.messages import DroneState, JournalPage, Jump, JumpHead, Keyframe, MissionPhase, Phase, Tick
+from protocol.importance import compile_kernels
+from protocol.loop_lag import LoopLag
+from protocol.messages import DroneState, JumpHead, MissionPhase, Phase, Tick
 from protocol.mission import Mission
-from protocol.replica import Replica
-from protocol.state_log import StateLog
+from protocol.replication import Integrated, Replication
+from protocol.synchroniser import Synchroniser, blocks_of
 
 log = logging.getLogger(__name__)
 
 LOCKSTEP_PATIENCE_S = 20.0
 """Wall time to wait for a live drone's state or a keyframe in lockstep; it runs out only when a process hangs."""
-REAL_TIME_PATIENCE_S = 0.02
 IDLE_TIMEOUT_S = 1.0
 METRICS_PERIOD_S = 1.0
 """Mission time between two rows of metrics.csv."""
-CHECKPOINT_PERIOD_S = 60.0
-"""Mission time between two writings of the trajectories, which take some tens of milliseconds."""
-SCORE_PERIOD_S = 10.0
-"""Mission time between two live F-scores."""
 STATUS_PERIOD_S = 0.5
 """Wall time between two status messages."""
-LEAD_TICKS, HEAD_EVERY_TICKS = 8, 4
-"""How far ahead of this process the simulator may fly in lockstep, and how often it is told."""
-JUMP_LEAD_TICKS = 4
-"""In real time, a jump that came too late for its tick takes effect so many ticks after now: time to travel."""
-KEYFRAME_BACKLOG = 200
-"""Keyframes that may wait for the map in real time; beyond it the newest are dropped and counted."""
-
-
-@dataclass(slots=True)
-class _Update:
-    """A map update that is being computed."""
-
-    effective: int
-    importance: float
-    task: asyncio.Task[MapUpdate]
+HEAD_EVERY_TICKS = 4
+"""How often everybody is told which jumps there are."""
 
 
 class GroundStation:
-    def __init__(self, mission: Mission, bus: Bus, run: RunFolder, journal: Journal, *, lockstep: bool) -> None:
-        self._mission, self._bus, self._run, self._journal, self._lockstep = mission, bus, run, journal, lockstep
-        self._patience_s = LOCKSTEP_PATIENCE_S if lockstep else REAL_TIME_PATIENCE_S
-        field = VirtualField.of(mission.target)
-        self._log = StateLog()
-        self._replica = Replica(ImportanceField(field, mission.sensing), journal.epoch)
-        self._schedule = FeedbackSchedule(mission.feedback, mission.tick_s)
-        self._mapper = Mapper(mission, field, run.path)
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix="mapper")
-        self._adding: set[asyncio.Task[None]] = set()
-        self._updates: deque[_Update] = deque()
-        self._clock = SimulatorClock(bus, lockstep=lockstep)
+    def __init__(
+        self, mission: Mission, bus: Bus, run: RunFolder, journal: Journal, mapper: Mapper, *, lockstep: bool
+    ) -> None:
+        self._mission, self._bus, self._run, self._lockstep = mission, bus, run, lockstep
+        self._mapper = mapper
+        self._wait_ticks = 0 if lockstep else round(mission.replication.wait_s / mission.tick_s)
+        self._replication = Replication(mission, authority=True, epoch=journal.epoch)
         self._board = StatusBoard(mission)
-        self._received: deque[Keyframe] = deque()
-        self._keyframes = 0
-        self._handed = 0  # to the map; in lockstep the simulator may be some ticks and images ahead
-        self._mapped = 0
-        self._dropped = 0
-        self._scores: Scores | None = None
-        self._scored_at = -math.inf
+        self._synchroniser = Synchroniser(bus, self._replication, rank=self._board.lost_states)
+        self._jumps = JumpPublisher(bus, journal, self._replication)
+        self._feedback = MapFeedback(mission, mapper, self._jumps, lockstep=lockstep)
+        self._recovery = Recovery(mission, bus, run, self._replication, self._jumps, self._feedback, mapper)
+        self._clock = SimulatorClock(bus, lockstep=lockstep, now_s=asyncio.get_running_loop().time)
+        self._lag = LoopLag()
         self._phase: Phase = "starting"
         self._reason = ""
         self._tick = 0
         self._promised = 0
-        bus.on(topics.STATE, self._hear_state)
-        bus.on(topics.KEYFRAME, self._hear_keyframe)
-        bus.serve(topics.JOURNAL, self._answer)
+        self._outdated = ""
+        bus.on(topics.TICK, self._replication.hear_tick)
+        bus.on(topics.STATE, self._hear_state, wakes=lockstep)
+        bus.on(topics.KEYFRAME, self._feedback.hear)
+        bus.serve(topics.BLOCKS, blocks_of(self._replication))
         bus.watch_lives()
 
-    # --- what comes in -------------------------------------------------------------------------------------------
-
     def _hear_state(self, state: DroneState) -> None:
-        self._log.hear(state)
-        self._board.hear(state)
-
-    def _hear_keyframe(self, keyframe: Keyframe) -> None:
-        self._keyframes += 1
-        self._received.append(keyframe)
-
-    def _answer(self, parameters: dict[str, str]) -> JournalPage:
-        try:
-            first, last = int(parameters.get("from", 0)), int(parameters.get("to", self._journal.next_sequence))
-        except ValueError as error:
-            raise MessageError(f"journal: from and to must be numbers: {parameters}") from error
-        return JournalPage(
-            epoch=self._journal.epoch,
-            next_sequence=self._journal.next_sequence,
-            jumps=self._journal.encoded(first, last),
-        )
+        if self._replication.hear_state(state):
+            self._board.hear(state)
+            replica = state.replica
+            if replica.epoch == self._jumps.epoch and replica.next_jump > self._jumps.next_sequence:
+                self._outdated = f"drone {state.drone} has jump {replica.next_jump - 1}, which the journal lacks"
 
     # --- the mission ---------------------------------------------------------------------------------------------
 
     async def run(self) -> None:
-        """From the first tick until J is low enough, time is up, or the simulator is gone."""
+        """From the first tick until J is low enough, time is up, or the simulator is gone.
+
+        Raises:
+            CovreconError: what an earlier life of this process left cannot be gone on with, or the disk refuses it.
+        """
+        await self._recovery.load()
         self._bus.announce("ground")
-        telling = asyncio.create_task(self._tell())
+        beside = [asyncio.create_task(self._tell()), asyncio.create_task(self._lag.watch())]
         try:
-            await self._fly()
+            async with self._synchroniser.running():
+                await self._fly()
+            await self._recovery.close()
             await self._finish()
         finally:
-            telling.cancel()
-            self._worker.shutdown(wait=False, cancel_futures=True)
-            with suppress(asyncio.CancelledError):
-                await telling
+            self._feedback.close()
+            self._jumps.close()
+            for task in beside:
+                task.cancel()
+                with suppress(asyncio.CancelledError):
+                    await task
         self._publish_status()
 
     async def _fly(self) -> None:
         while not self._reason:
             tick = await self._clock.next_tick(IDLE_TIMEOUT_S)
             if tick is not None:
+                if self._phase == "starting":
+                    self._recovery.begin(tick)
                 self._phase = "flying"
                 await self._step(tick)
-                self._reason = self._end_of(tick)
                 self._publish_head(tick.tick)
-            elif self._phase == "flying" and "sim" not in self._bus.alive:
+            elif self._clock.is_gone:
                 self._reason = "the simulator is gone"
 
     async def _step(self, tick: Tick) -> None:
         self._tick = tick.tick
-        complete = await self._bus.until(lambda: self._is_complete(tick), self._patience_s)
-        if self._lockstep and not complete:
+        if self._outdated:
+            await self._jumps.renew(self._outdated)
+            self._outdated = ""
+        if self._lockstep and not await self._bus.until(lambda: self._is_complete(tick), LOCKSTEP_PATIENCE_S):
             log.warning("tick %d: going on without all states and keyframes: this run cannot be repeated", tick.tick)
-        await self._map_keyframes(tick)
-        await self._settle_updates(tick)
-        ids, poses = self._log.poses_at(tick.tick, tick.live)
-        self._replica.advance(tick.tick, poses, self._mission.tick_s)
-        self._log.forget_before(tick.tick)
+        self._feedback.hand_over(tick.tick)
+        await self._feedback.settle(tick.tick)
+        steps = self._replication.integrate(tick.tick, self._bus.alive, self._wait_ticks)
+        if self._replication.known:
+            self._board.activity = ""
+            for step in steps:
+                self._take_in(step)
+        else:
+            self._board.activity = "fetching phi from the drones"
+            self._recovery.proceed(hopeless=self._board.all_lack_phi(tick.live))
+        self._recovery.save_if_due()
+        digest = self._replication.take_digest()
+        if digest is not None:
+            self._bus.put(topics.DIGEST, digest)
         self._board.note_lives(self._bus.alive)
-        self._record(tick, dict(zip(ids, poses.tolist(), strict=True)))
-        if self._schedule.is_due(tick.tick):
-            self._start_update(tick)
 
     def _is_complete(self, tick: Tick) -> bool:
-        waited_for = [drone for drone in tick.live if f"drone/{drone}" in self._bus.alive]
-        arrived = self._keyframes >= tick.keyframes or not self._lockstep
-        return arrived and self._log.has_all(tick.tick, waited_for)
+        return self._feedback.received >= tick.keyframes and self._replication.is_ready(tick.tick, self._bus.alive)
 
-    def _end_of(self, tick: Tick) -> str:
+    def _take_in(self, step: Integrated) -> None:
+        """Record a tick that is integrated, and do what is due at it."""
+        self._record(step.tick, dict(zip(step.ids, step.poses.tolist(), strict=True)))
+        self._feedback.look(step.tick, self._replication.importance)
+        self._reason = self._reason or self._end_of(step.tick)
+
+    def _end_of(self, tick: int) -> str:
         """Why the mission is over after this tick; empty while it is not."""
-        importance = self._replica.field.importance
-        if importance < self._mission.stop_below:
+        if self._replication.importance < self._mission.stop_below:
             return f"importance fell below {self._mission.stop_below:g}"
-        if (tick.tick + 1) * self._mission.tick_s >= self._mission.duration_s:
+        if (tick + 1) * self._mission.tick_s >= self._mission.duration_s:
             return f"duration of {self._mission.duration_s:g} s reached"
         return ""
 
-    # --- the map -------------------------------------------------------------------------------------------------
-
-    async def _map_keyframes(self, tick: Tick) -> None:
-        """Hand what was photographed before this tick to the map, in an order that does not depend on arrival."""
-        ready = sorted(
-            (keyframe for keyframe in self._received if keyframe.tick < tick.tick),
-            key=lambda keyframe: (keyframe.tick, keyframe.drone),
-        )
-        self._received = deque(keyframe for keyframe in self._received if keyframe.tick >= tick.tick)
-        if not ready:
-            return
-        self._handed += len(ready)
-        if not self._lockstep and len(self._adding) >= KEYFRAME_BACKLOG:
-            self._dropped += len(ready)
-            return
-        task = asyncio.create_task(self._add(ready))
-        self._adding.add(task)
-        task.add_done_callback(self._adding.discard)
-
-    async def _add(self, keyframes: list[Keyframe]) -> None:
-        await asyncio.get_running_loop().run_in_executor(self._worker, self._mapper.add, keyframes)
-        self._mapped += len(keyframes)
-
-    def _start_update(self, tick: Tick) -> None:
-        scored = tick.time_s - self._scored_at >= SCORE_PERIOD_S
-        if scored:
-            self._scored_at = tick.time_s
-        loop = asyncio.get_running_loop()
-
-        async def compute() -> MapUpdate:
-            return await loop.run_in_executor(self._worker, lambda: self._mapper.update(scored=scored))
-
-        self._updates.append(
-            _Update(
-                effective=self._schedule.effective_tick(tick.tick),
-                importance=self._replica.field.importance,
-                task=asyncio.create_task(compute()),
-            )
-        )
-
-    async def _settle_updates(self, tick: Tick) -> None:
-        """Turn finished updates into jumps.
-
-        In lockstep exactly when one is about to take effect, and then it is waited for: what is recorded does not
-        depend on how fast the machine was.
-        """
-        while self._updates:
-            update = self._updates[0]
-            if not (update.effective <= tick.tick + 1 if self._lockstep else update.task.done()):
-                return
-            result = await update.task
-            self._updates.popleft()
-            self._scores = result.scores or self._scores
-            effective = update.effective if self._lockstep else max(update.effective, tick.tick + JUMP_LEAD_TICKS)
-            self._jump(result, update.importance, effective)
-
-    def _jump(self, result: MapUpdate, importance: float, effective: int) -> None:
-        increments = self._schedule.increments(result.change, importance)
-        if increments is None:
-            return
-        jump = Jump(
-            epoch=self._journal.epoch,
-            sequence=self._journal.next_sequence,
-            tick=effective,
-            increments=increments,
-        )
-        encoded = self._journal.append(jump)
-        self._bus.put_encoded(topics.JUMP, encoded)
-        self._replica.hear(jump)
-
     # --- what goes out -------------------------------------------------------------------------------------------
 
-    def _record(self, tick: Tick, poses: dict[int, list[float]]) -> None:
+    def _record(self, tick: int, poses: dict[int, list[float]]) -> None:
         controls = self._board.controls(poses)
         self._run.record_tick(
-            tick.tick,
-            tick.time_s,
+            tick,
+            tick * self._mission.tick_s,
             poses,
             {drone: control.solve_s for drone, control in controls.items()},
             {drone: control.slack for drone, control in controls.items()},
             {drone: control.outcome for drone, control in controls.items() if control.outcome != "solved"},
         )
         self._board.note_poses(poses)
-        if tick.tick % max(1, round(METRICS_PERIOD_S / self._mission.tick_s)) == 0:
+        if tick % max(1, round(METRICS_PERIOD_S / self._mission.tick_s)) == 0:
             self._run.record_metrics(self._metrics())
-        if tick.tick % max(1, round(CHECKPOINT_PERIOD_S / self._mission.tick_s)) == 0:
-            self._run.checkpoint()
 
     def _metrics(self) -> Metrics:
         return Metrics(
             time_s=self._tick * self._mission.tick_s,
             tick=self._tick,
-            importance=self._replica.field.importance,
-            scores=self._scores,
-            jumps=self._journal.next_sequence,
-            keyframes=self._handed,
+            importance=self._replication.importance,
+            scores=self._feedback.scores,
+            jumps=self._jumps.count,
+            keyframes=self._feedback.handed,
         )
 
     def _publish_head(self, tick: int) -> None:
-        """Say how far the simulator may go: not past a jump that is not out yet, nor far ahead of this process."""
-        done = min(self._schedule.settled_after(tick), tick + LEAD_TICKS)
-        if self._updates:
-            done = min(done, self._updates[0].effective - 1)
-        done = max(done, tick + 1)
+        """Say which jumps there are, and how far ahead no other can come: in lockstep, so far the simulator may fly."""
+        done = self._feedback.settled_until(tick)
         finished = bool(self._reason)
         awaited = self._promised <= tick + 1  # the simulator has used up what it was promised
         if not (finished or awaited or done - self._promised >= HEAD_EVERY_TICKS):
             return
         self._promised = done
         head = JumpHead(
-            epoch=self._journal.epoch,
-            next_sequence=self._journal.next_sequence,
+            epoch=self._jumps.epoch,
+            next_sequence=self._jumps.next_sequence,
             done=done,
             phase="finished" if finished else self._phase,
         )
@@ -302,9 +209,13 @@ class GroundStation:
     def _publish_status(self) -> None:
         status = self._board.status(
             self._metrics(),
+            self._replication.state(),
             phase=self._phase,
-            backlog=self._handed - self._mapped,
-            dropped=self._dropped + self._mapper.refused,
+            backlog=self._feedback.backlog,
+            dropped=self._feedback.unused,
+            refused=self._replication.refused + sum(self._bus.statistics.refused.values()),
+            unwritten=self._jumps.unwritten + self._recovery.unwritten + self._run.refused_writes,
+            loop_lag_s=self._lag.p99_s,
             alive=self._bus.alive,
             now_s=asyncio.get_running_loop().time(),
         )
@@ -318,16 +229,11 @@ class GroundStation:
         self._publish_head(self._tick)
         self._publish_phase()
         log.info("mission finished: %s", self._reason)
-        loop = asyncio.get_running_loop()
         self._board.activity = "completing the map"
-        for update in self._updates:
-            update.task.cancel()
-        if self._adding:
-            await asyncio.wait(self._adding)
-        result = await loop.run_in_executor(self._worker, self._mapper.finish)
-        self._scores = result.scores or self._scores
+        result = await self._feedback.finish()
         self._board.activity = "writing the results"
-        await loop.run_in_executor(self._worker, self._write_results, result, loop.time())
+        now_s = asyncio.get_running_loop().time()
+        await self._feedback.on_worker(lambda: self._write_results(result, now_s))
         self._board.activity = self._reason
 
     def _write_results(self, result: MapUpdate, now_s: float) -> None:
@@ -340,7 +246,7 @@ class GroundStation:
         self._run.finish(
             final,
             floor_baseline=self._mapper.floor_scores(),
-            phi_sha256=self._replica.field.sha256,
+            phi_sha256=self._replication.replica.field.sha256,
             wall_time_s=self._board.wall_s(now_s),
             exit_reason=self._reason,
         )
@@ -348,14 +254,16 @@ class GroundStation:
 
 
 async def run_ground_station(mission: Mission, endpoint: str, folder: Path, *, lockstep: bool) -> None:
-    """Be the ground station, and the router, of ``mission``; results go to ``folder``."""
+    """Be the ground station of ``mission``; results go to ``folder``."""
     run = RunFolder(folder, mission)
     try:
         compile_kernels()
         log.info("rehearsing the map")
         rehearse(mission)
-        with Journal(folder / "journal") as journal:
-            async with connect(endpoint, mission.name, router=True, lossless=lockstep) as bus:
-                await GroundStation(mission, bus, run, journal, lockstep=lockstep).run()
+        journal = open_journal(folder / JOURNAL_FILE)
+        with KeyframeLog(folder / KEYFRAMES_FILE) as keyframes:
+            mapper = Mapper(mission, VirtualField.of(mission.target), folder, keyframes)
+            async with connect(endpoint, mission.name, lossless=lockstep) as bus:
+                await GroundStation(mission, bus, run, journal, mapper, lockstep=lockstep).run()
     finally:
         run.close()

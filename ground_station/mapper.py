@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import itertools
 import logging
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,9 +15,10 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from ground_station.evaluation import FULL_SAMPLES, LIVE_SAMPLES, Scores, Truth, floor_baseline, load_truth, score
+from ground_station.keyframe_log import KeyframeLog
 from ground_station.mesh_change import GridMeshChange
 from ground_station.reconstruction.backends import make_reconstructor
-from ground_station.reconstruction.reconstructor import Keyframe, Mesh
+from ground_station.reconstruction.reconstructor import Keyframe, Mesh, State
 from protocol import messages
 from protocol.errors import ReconstructionError
 from protocol.field import VirtualField
@@ -37,33 +40,61 @@ class MapUpdate:
     """None when not asked for, or when no truth is known."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class MapState:
+    """The map at one moment, for a checkpoint."""
+
+    reconstruction: State
+    first: int
+    """Position in the keyframe log from which the reconstructor needs to see keyframes again ..."""
+    end: int
+    """... and from which on they are not in this map."""
+    unreadable: int
+    """Part of `Mapper.refused`."""
+
+
 class Mapper:
     """Not thread-safe on purpose: all calls come from one worker."""
 
-    def __init__(self, mission: Mission, field: VirtualField, run: Path) -> None:
-        self._mission, self._run = mission, run
+    def __init__(self, mission: Mission, field: VirtualField, run: Path, keyframes: KeyframeLog) -> None:
+        """``run`` is where the truth is looked for, ``keyframes`` where all that are added are kept."""
+        self._mission, self._run, self._log = mission, run, keyframes
         self._rules: dict[int, KeyframeRule] = {}
         self._reconstructor = make_reconstructor(mission)
         self._change = GridMeshChange(mission.target, mission.feedback, (field.xs, field.ys, field.zs))
         self._truth: Truth | None = None
+        self._recent: deque[int] = deque(maxlen=self._reconstructor.lookback)
+        self._unreadable = 0
         self.refused = 0
         """Images or poses that could not be read, or that the reconstructor cannot use."""
 
     def add(self, keyframes: Sequence[messages.Keyframe]) -> None:
         """Take in keyframes in order; what cannot be used is counted and said, and the mission goes on."""
-        readable = []
         for message in keyframes:
-            try:
-                keyframe = _decode(message)
-            except (ReconstructionError, UnidentifiedImageError, OSError, ValueError) as error:
-                self.refused += 1
-                log.warning("drone %d: keyframe %d refused: %s", message.drone, message.sequence, error)
-                continue
-            rule = self._rules.setdefault(keyframe.drone, KeyframeRule(self._mission.camera))
-            if rule.wants(keyframe.position, keyframe.rotation):
-                readable.append(keyframe)
-        outcomes = self._reconstructor.add(readable)
-        self.refused += sum(outcome.state == "refused" for outcome in outcomes)
+            self._recent.append(self._log.end)
+            self._log.append(message)
+        self._map(keyframes)
+
+    def _map(self, keyframes: Sequence[messages.Keyframe]) -> None:
+        readable = (self._read(message) for message in keyframes)
+        self._reconstructor.add([keyframe for keyframe in readable if keyframe is not None])
+        self.refused = self._unreadable + sum(self._reconstructor.statistics().refused.values())
+
+    def _read(self, message: messages.Keyframe) -> Keyframe | None:
+        """The keyframe in ``message``; None if it cannot be read, or the camera hardly moved since the last."""
+        try:
+            keyframe = _decode(message)
+        except (ReconstructionError, UnidentifiedImageError, OSError, ValueError) as error:
+            self._unreadable += 1
+            log.warning("drone %d: keyframe %d refused: %s", message.drone, message.sequence, error)
+            return None
+        rule = self._rules.setdefault(keyframe.drone, KeyframeRule(self._mission.camera))
+        return keyframe if rule.wants(keyframe.position, keyframe.rotation) else None
+
+    @property
+    def taken(self) -> int:
+        """Keyframes that the log holds: all since the start of the mission, also from before a restart."""
+        return self._log.count
 
     def update(self, *, scored: bool) -> MapUpdate:
         """The mesh of all that is fused by now, and where it changed."""
@@ -79,6 +110,47 @@ class Mapper:
     def floor_scores(self) -> Scores | None:
         """What nothing but a bare floor scores here."""
         return floor_baseline(self._truth, self._mission.target) if self._truth else None
+
+    def state(self) -> MapState:
+        """For a checkpoint; nothing of it changes any more.
+
+        Raises:
+            StorageError: the disk refused keyframes that it speaks of.
+        """
+        self._log.sync()
+        end = self._log.end
+        first = self._recent[0] if self._recent else end
+        return MapState(self._reconstructor.state(), first, end, self._unreadable)
+
+    def restore(self, state: MapState | None) -> int:
+        """In a new mapper: the map as it was at the checkpoint, then the keyframes that the log has from after it.
+
+        Without a checkpoint, the whole map anew from the log, some ten milliseconds a keyframe. The next update's
+        change is against this map: what led to jumps before does not lead to them again. Returns how many keyframes
+        were mapped again.
+
+        Raises:
+            ReconstructionError: the state is another mission's.
+        """
+        if state is not None:
+            self._reconstructor.restore(state.reconstruction, self._known(state))
+            self._unreadable = state.unreadable
+        count = 0
+        later = self._log.read(state.end if state else 0, self._log.end)
+        for _, group in itertools.groupby(later, key=lambda found: found[1].tick):
+            positions, keyframes = zip(*group, strict=True)
+            self._recent.extend(positions)
+            self._map(keyframes)
+            count += len(keyframes)
+        self.update(scored=False)
+        return count
+
+    def _known(self, state: MapState) -> Iterator[Keyframe]:
+        for position, message in self._log.read(state.first, state.end):
+            self._recent.append(position)
+            keyframe = self._read(message)
+            if keyframe is not None:
+                yield keyframe
 
     def _score(self, mesh: Mesh, samples: int) -> Scores | None:
         if self._truth is None:

@@ -4,32 +4,34 @@
 * ``metrics.csv``: one row a second, readable while the run goes on and after it was killed.
 * ``trajectories.npz``: ``drones`` ids (D,), ``tick`` and ``time_s`` (T,), ``poses`` (T, D, 5), NaN where a drone was
   not heard; of the controllers, (T, D), ``solve_time_s``, ``slack`` and ``fallback``: why the drone braked, or "".
+  Ticks between the last checkpoint and a crash are missing.
 * ``mesh.ply``, ``mesh.glb``: the map with vertex colours; PLY in the world frame, GLB with y up as glTF demands.
 * ``summary.json``: the figures by which runs are compared, and hashes that show whether two runs were the same.
 """
 
 from __future__ import annotations
 
-import csv
-import hashlib
 import importlib.metadata
-import io
 import json
+import logging
 import math
-import os
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ground_station.durable import DiskFaults, replace_file, set_aside
 from ground_station.evaluation import Scores
+from ground_station.journal import JOURNAL_FILE
+from ground_station.mesh_files import Colours, Faces, Vertices, glb, mesh_sha256, ply
+from ground_station.metrics_file import MetricsFile
 from ground_station.separation import nearest_distances
-from protocol.errors import MissionError
+from ground_station.trajectories import Trajectories
+from protocol.errors import MissionError, StorageError
 from protocol.mission import Mission
+
+log = logging.getLogger(__name__)
 
 MISSION_FILE = "mission.json"
 METRICS_FILE = "metrics.csv"
@@ -38,21 +40,13 @@ MESH_PLY_FILE = "mesh.ply"
 MESH_GLB_FILE = "mesh.glb"
 SUMMARY_FILE = "summary.json"
 
-COORDINATES = 5
-"""x, y, z in metres, yaw and pitch in radians."""
 DECIMALS = 6
 """Of the figures in metrics.csv and summary.json: micrometres and microseconds."""
-GLB_MATERIAL = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}, "doubleSided": True}
-"""Without it viewers show glTF's default, a dark metal."""
 PACKAGES = (
     "coverage-recon", "eclipse-zenoh", "mavsdk", "msgpack", "numba", "numpy", "open3d", "open3d-cpu", "osqp",
     "pydantic", "scipy", "torch", "trimesh",
 )  # fmt: skip
 """Those whose version may change a result."""
-
-Vertices: TypeAlias = NDArray[np.float32]
-Faces: TypeAlias = NDArray[np.int32]
-Colours: TypeAlias = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,39 +110,76 @@ class Summary:
 
 
 class RunFolder:
-    """Writer of a run's folder; one process has it open.
+    """Writer of a run's folder; one process has it open. During the flight a disk that refuses is said and counted.
 
-    Raises MissionError if the folder holds another mission, or a flight: nothing that was recorded is written over.
+    Opened again after a crash it goes on: rows are appended, and trajectories continue from the last checkpoint.
     """
 
     def __init__(self, path: Path, mission: Mission) -> None:
+        """Open or create.
+
+        Raises:
+            MissionError: it holds another mission, or a flight that cannot be gone on with, being finished or without
+                a journal: nothing that was recorded is written over.
+            StorageError: the disk refuses it.
+        """
         self.path = path
         self._mission = mission
         self._drones = sorted(drone.id for drone in mission.drones)
-        self._column = {drone: index for index, drone in enumerate(self._drones)}
-        self._ticks: list[int] = []
-        self._times: list[float] = []
-        self._poses: list[NDArray[np.float64]] = []
-        self._solve_times: list[list[float]] = []
-        self._slacks: list[list[float]] = []
-        self._fallbacks: list[list[str]] = []
         self._separations = dict.fromkeys(self._drones, math.inf)
         self._min_separation = math.inf
+        self._last_row = -1
         self._mesh_sha256: str | None = None
+        self._trajectories = Trajectories(self._drones)
+        self._faults = DiskFaults(f"{path}: record of the flight")
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            self._keep_mission()
+            self._metrics = self._open_metrics()
+            self._resume()
+        except OSError as error:
+            raise _storage_error(path, error) from error
 
-        path.mkdir(parents=True, exist_ok=True)
-        self._keep_mission()
-        file = path / METRICS_FILE
-        if file.exists():
+    def _open_metrics(self) -> MetricsFile:
+        file = self.path / METRICS_FILE
+        if (self.path / SUMMARY_FILE).exists():
             raise MissionError([f"{file}: this folder holds a flight already; take a new one"])
-        # Line buffered: each row reaches the operating system in one write, whatever then happens to this process.
-        self._rows = file.open("x", buffering=1, encoding="utf-8", newline="")
-        self._writer = csv.writer(self._rows, lineterminator="\n")
-        self._writer.writerow(_columns(self._drones))
+        try:
+            metrics = MetricsFile(file, _columns(self._drones), self._faults)
+        except ValueError as error:
+            log.error("%s %s; it is now %s", file, error, set_aside(file).name)  # noqa: TRY400  # the file is wrong
+            return self._open_metrics()
+        crashed = any(self.path.glob(f"{JOURNAL_FILE}*"))  # also one that was set aside
+        if metrics.rows() and not crashed:
+            metrics.close()
+            raise MissionError([f"{file}: this folder holds a flight already; take a new one"])
+        return metrics
+
+    def _resume(self) -> None:
+        rows = self._metrics.rows()
+        self._last_row = int(max((row.get("tick", -1) for row in rows), default=-1))
+        self._min_separation = min((row.get("min_separation_m", math.inf) for row in rows), default=math.inf)
+        file = self.path / TRAJECTORIES_FILE
+        if not file.exists():
+            return
+        try:
+            self._trajectories.read(file)
+        except ValueError as error:
+            log.error("%s: %s; it is now %s", file, error, set_aside(file).name)  # noqa: TRY400  # the file is wrong
+
+    @property
+    def refused_writes(self) -> int:
+        """How often the disk refused a row or a checkpoint; they are kept in memory and tried again."""
+        return self._faults.count
+
+    @property
+    def min_separation_m(self) -> float | None:
+        """Smallest distance between any two drones so far, also before a crash; None for a single drone."""
+        return self._min_separation if math.isfinite(self._min_separation) else None
 
     def close(self) -> None:
         """Release the folder; may be repeated. What was recorded since the last checkpoint stays out of the npz."""
-        self._rows.close()
+        self._metrics.close()
 
     def record_tick(
         self,
@@ -164,21 +195,18 @@ class RunFolder:
         ``poses`` are x, y, z in metres, yaw, pitch in radians; ``fallbacks`` say why a drone braked, "" if it did
         not. Costs some ten microseconds: it is called 200 times a second.
         """
-        row = np.full((len(self._drones), COORDINATES), np.nan)
-        for drone, pose in poses.items():
-            row[self._column[drone]] = pose
-        self._ticks.append(tick)
-        self._times.append(time_s)
-        self._poses.append(row)
-        self._solve_times.append([solve_times_s.get(drone, math.nan) for drone in self._drones])
-        self._slacks.append([slacks.get(drone, math.nan) for drone in self._drones])
-        self._fallbacks.append([fallbacks.get(drone, "") for drone in self._drones])
+        self._trajectories.add(tick, time_s, poses, solve_times_s, slacks, fallbacks)
         for drone, distance in nearest_distances(poses).items():
             self._separations[drone] = min(self._separations[drone], distance)
             self._min_separation = min(self._min_separation, distance)
 
     def record_metrics(self, metrics: Metrics) -> None:
-        """Append a row. Separations are the smallest since the previous row, so no tick is hidden between rows."""
+        """Append a row. Separations are the smallest since the previous row, so no tick is hidden between rows.
+
+        Ticks that have a row from before a crash keep that one.
+        """
+        if metrics.tick <= self._last_row:
+            return
         separations = [self._separations[drone] for drone in self._drones]
         scores = metrics.scores
         row = [
@@ -192,38 +220,46 @@ class RunFolder:
             min(separations),
             *separations,
         ]
-        self._writer.writerow([_rounded(value) for value in row])
+        self._metrics.append([_rounded(value) for value in row])
         self._separations = dict.fromkeys(self._drones, math.inf)
 
     def write_mesh(self, vertices: Vertices, faces: Faces, colours: Colours) -> None:
-        """Write the map: (V, 3) metres in the world frame, (F, 3) vertex indices, (V, 3) sRGB. No files if empty."""
+        """Write the map: (V, 3) metres in the world frame, (F, 3) vertex indices, (V, 3) sRGB. No files if empty.
+
+        Raises:
+            StorageError: the disk refuses it.
+        """
         if not len(faces):
             return
         self._mesh_sha256 = mesh_sha256(vertices, faces)
-        _write_atomically(self.path / MESH_PLY_FILE, _mesh_file(vertices, faces, colours, "ply"))
-        _write_atomically(self.path / MESH_GLB_FILE, _glb(vertices, faces, colours))
+        self._replace(MESH_PLY_FILE, ply(vertices, faces, colours))
+        self._replace(MESH_GLB_FILE, glb(vertices, faces, colours))
 
     def checkpoint(self) -> None:
-        """Write trajectories and solver outcomes recorded so far: what is left of them if the process is killed."""
-        shape = (len(self._ticks), len(self._drones))
-        content = io.BytesIO()
-        np.savez_compressed(
-            content,
-            drones=np.array(self._drones),
-            tick=np.array(self._ticks, dtype=np.int64),
-            time_s=np.array(self._times, dtype=np.float64),
-            poses=np.array(self._poses, dtype=np.float64).reshape(*shape, COORDINATES),
-            solve_time_s=np.array(self._solve_times, dtype=np.float64).reshape(shape),
-            slack=np.array(self._slacks, dtype=np.float64).reshape(shape),
-            fallback=np.array(self._fallbacks, dtype=np.str_).reshape(shape),
-        )
-        _write_atomically(self.path / TRAJECTORIES_FILE, content.getvalue())
+        """Write trajectories and solver outcomes recorded so far: what is left of them if the process is killed.
+
+        May be called from another thread than the rest; it takes some tens of milliseconds, more in long flights.
+        """
+        try:
+            self._trajectories.write(self.path / TRAJECTORIES_FILE)
+        except OSError as error:
+            self._faults.refused(error)
+        else:
+            self._faults.took()
 
     def finish(
         self, final: Metrics, *, floor_baseline: Scores | None, phi_sha256: str, wall_time_s: float, exit_reason: str
     ) -> Summary:
-        """Write the last checkpoint and the summary; the mesh must have been written before."""
-        self.checkpoint()
+        """Write the last checkpoint and the summary; the mesh must have been written before.
+
+        Raises:
+            StorageError: the disk refuses something, and what it refused during the flight is still not written.
+        """
+        try:
+            self._metrics.flush()
+            self._trajectories.write(self.path / TRAJECTORIES_FILE)
+        except OSError as error:
+            raise _storage_error(self.path, error) from error
         summary = Summary(
             mission=self._mission.name,
             seed=self._mission.seed,
@@ -231,25 +267,30 @@ class RunFolder:
             exit_reason=exit_reason,
             final=final,
             floor_baseline=floor_baseline,
-            min_separation_m=self._min_separation if math.isfinite(self._min_separation) else None,
-            fallbacks={
-                drone: sum(bool(reasons[index]) for reasons in self._fallbacks) for drone, index in self._column.items()
-            },
+            min_separation_m=self.min_separation_m,
+            fallbacks=self._trajectories.fallbacks(),
             wall_time_s=wall_time_s,
             phi_sha256=phi_sha256,
             mesh_sha256=self._mesh_sha256,
             versions=versions(),
         )
         text = json.dumps(summary.as_json(), indent=2, allow_nan=False) + "\n"
-        _write_atomically(self.path / SUMMARY_FILE, text.encode())
+        self._replace(SUMMARY_FILE, text.encode())
         return summary
+
+    def _replace(self, name: str, content: bytes) -> None:
+        try:
+            replace_file(self.path / name, [content])
+        except OSError as error:
+            raise _storage_error(self.path / name, error) from error
 
     def _keep_mission(self) -> None:
         path = self.path / MISSION_FILE
         content = (self._mission.model_dump_json(indent=2) + "\n").encode()
-        if path.exists() and path.read_bytes() != content:
+        if not path.exists():
+            replace_file(path, [content])
+        elif path.read_bytes() != content:
             raise MissionError([f"{path}: this run folder belongs to another mission"])
-        _write_atomically(path, content)
 
 
 def versions() -> dict[str, str]:
@@ -261,13 +302,6 @@ def versions() -> dict[str, str]:
         except importlib.metadata.PackageNotFoundError:
             continue  # an optional part that is not installed cannot have changed anything
     return found
-
-
-def mesh_sha256(vertices: Vertices, faces: Faces) -> str:
-    """Hash over the vertices as little-endian float32, then the faces as little-endian int32."""
-    digest = hashlib.sha256(np.ascontiguousarray(vertices, dtype="<f4").tobytes())
-    digest.update(np.ascontiguousarray(faces, dtype="<i4").tobytes())
-    return digest.hexdigest()
 
 
 def _columns(drones: Sequence[int]) -> list[str]:
@@ -295,34 +329,5 @@ def _rounded(value: float | None) -> float | None:
     return round(value, DECIMALS)
 
 
-def _write_atomically(path: Path, content: bytes) -> None:
-    """A reader sees the old file or the new one, and so does whoever looks after a power cut."""
-    draft = path.with_name(f".{path.name}.draft")
-    with draft.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    draft.replace(path)
-
-
-def _mesh_file(vertices: Vertices, faces: Faces, colours: Colours, file_type: str, **options: Any) -> bytes:
-    import trimesh
-
-    content = io.BytesIO()
-    mesh = trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False)
-    mesh.export(content, file_type=file_type, **options)
-    return content.getvalue()
-
-
-def _glb(vertices: Vertices, faces: Faces, colours: Colours) -> bytes:
-    """glTF 2.0: y up, right-handed, and vertex colours linear in light rather than sRGB (sections 3.4, 3.7.2.1)."""
-
-    def add_material(tree: dict[str, Any]) -> None:
-        tree["materials"] = [GLB_MATERIAL]
-        tree["meshes"][0]["primitives"][0]["material"] = 0
-
-    upright = np.column_stack([vertices[:, 0], vertices[:, 2], -vertices[:, 1]])
-    level = np.arange(256) / 255
-    linear = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
-    shown = np.round(255 * linear).astype(np.uint8)[colours]
-    return _mesh_file(upright, faces, shown, "glb", tree_postprocessor=add_material)
+def _storage_error(path: Path, error: OSError) -> StorageError:
+    return StorageError(f"{error.filename or path}: {error.strerror}")

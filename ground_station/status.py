@@ -9,10 +9,13 @@ from collections.abc import Set as AbstractSet
 
 from ground_station.results import Metrics
 from ground_station.separation import nearest_distances
-from protocol.messages import Control, DroneState, DroneStatus, Phase, Status
+from protocol.messages import Control, DroneState, DroneStatus, Phase, ReplicaState, Status
 from protocol.mission import Mission
 
 log = logging.getLogger(__name__)
+
+
+UNKNOWN = 2**62
 
 
 class StatusBoard:
@@ -31,6 +34,16 @@ class StatusBoard:
         known = self._newest.get(state.drone)
         if known is None or known.tick <= state.tick:
             self._newest[state.drone] = state
+
+    def all_lack_phi(self, drones: Iterable[int]) -> bool:
+        """Whether each of ``drones``, at least one, says that its phi is not complete."""
+        states = [self._newest.get(drone) for drone in drones]
+        return bool(states) and all(state is not None and state.replica.missing > 0 for state in states)
+
+    def lost_states(self, drone: int) -> int:
+        """How many states the phi of ``drone`` lacks, for whoever has to choose one; very many if it never spoke."""
+        state = self._newest.get(drone)
+        return state.replica.lost if state is not None else UNKNOWN
 
     def note_lives(self, alive: AbstractSet[str]) -> None:
         """Say who came and who went."""
@@ -56,7 +69,18 @@ class StatusBoard:
         return 0.0 if self._began_s is None else now_s - self._began_s
 
     def status(
-        self, metrics: Metrics, *, phase: Phase, backlog: int, dropped: int, alive: AbstractSet[str], now_s: float
+        self,
+        metrics: Metrics,
+        replica: ReplicaState,
+        *,
+        phase: Phase,
+        backlog: int,
+        dropped: int,
+        refused: int,
+        unwritten: int,
+        loop_lag_s: float,
+        alive: AbstractSet[str],
+        now_s: float,
     ) -> Status:
         """``now_s``: monotonic wall time, for rates."""
         if self._began_s is None and phase != "starting":
@@ -76,6 +100,10 @@ class StatusBoard:
             f_score_objects=scores.objects.f if scores else 0.0,
             keyframes=metrics.keyframes,
             dropped=dropped,
+            replica=replica,
+            refused=refused,
+            unwritten=unwritten,
+            loop_lag_s=loop_lag_s,
             keyframes_per_s=rate,
             jumps=metrics.jumps,
             min_separation_m=self._separation if math.isfinite(self._separation) else 0.0,

@@ -6,7 +6,8 @@ and small, and a dense array is what the CPU's caches and the mesh extraction li
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Mapping
+from typing import Any, Final
 
 import numpy as np
 from numba import njit
@@ -48,6 +49,46 @@ class Volume:
     @property
     def size_bytes(self) -> int:
         return self.distance.nbytes + self.weight.nbytes + self.color.nbytes
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """What `restore` needs, less than half of the memory: most voxels were never seen, or only seen through.
+
+        Bit-exact. Compressing it further would take ten times as long and save a seventh.
+        """
+        seen = self.weight > 0
+        near = self._near(seen)
+        return {
+            "seen": np.packbits(seen),
+            "near": np.packbits(near),
+            "weight": self.weight[seen],
+            "distance": self.distance[near],
+            "color": self.color[near],
+        }
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Be the volume that ``state`` was taken of. Raises `ReconstructionError` if that was another box or voxel."""
+        size = self.weight.size
+        masks = [np.unpackbits(state[name]).astype(bool) for name in ("seen", "near")]
+        counts = [np.count_nonzero(mask) for mask in masks]
+        lengths = [len(state[name]) for name in ("weight", "distance", "color")]
+        if any(len(mask) != 8 * -(-size // 8) for mask in masks) or lengths != [counts[0], counts[1], counts[1]]:
+            raise ReconstructionError(f"the state of a volume does not fit one of {self.weight.shape} voxels")
+        seen, near = (mask[:size].reshape(self.weight.shape) for mask in masks)
+        self.weight[:] = 0
+        self.distance[:] = 0
+        self.color[:] = 0
+        self.weight[seen] = state["weight"]
+        self.distance[seen] = self.truncation
+        self.distance[near] = state["distance"]
+        self.color[near] = state["color"]
+
+    def _near(self, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which of the voxels ``seen`` hold more than "in front of the surface by at least the truncation"."""
+        near: NDArray[np.bool_] = self.distance != np.float32(self.truncation)
+        for channel in range(3):
+            near |= self.color[..., channel] != 0
+        near &= seen
+        return near
 
     def integrate(
         self, view: View, depth: NDArray[np.float32], weight: NDArray[np.float32], color: NDArray[np.uint8]

@@ -8,10 +8,10 @@ before it is fused. What is done when depends on the keyframes given alone, neve
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from ground_station.reconstruction.consistency import agreements
 from ground_station.reconstruction.depth_map import DepthEstimator, DepthMap
 from ground_station.reconstruction.depth_range import DepthRange, depth_range
 from ground_station.reconstruction.fusion import Volume
-from ground_station.reconstruction.reconstructor import Keyframe, Mesh, Outcome, Refusal, Statistics
+from ground_station.reconstruction.reconstructor import Keyframe, Mesh, Outcome, Refusal, State, Statistics
 from ground_station.reconstruction.source_views import ViewIndex
 from ground_station.reconstruction.surface_nets import extract_mesh
 from ground_station.reconstruction.views import CONTRAST_MIN, SHARPNESS_MIN, View, contrast, sharpness, shrink, to_grey
@@ -30,6 +30,8 @@ LOOK_AHEAD: Final = 3
 """Later keyframes of the same drone that a keyframe waits for; 3 x 0.12 m is the widest useful baseline."""
 PATIENCE_S: Final = 3.0
 """Mission time after which a hovering drone's last keyframes are used without later ones."""
+RESWEPT: Final = 4 * LOOK_AHEAD
+"""Newest keyframes of each drone that get depth again after a restart: those that wait, and as many before them."""
 VIEWS_KEPT: Final = 512
 """Newest keyframes that others may be compared with; 2048 made no better map, and 512 at 160 x 90 take 88 MB."""
 TYPICAL_SHARE: Final = 0.6
@@ -81,7 +83,8 @@ class PlaneSweepReconstructor:
         self._due: list[tuple[_Entry, Future[DepthMap]]] = []
         self._decided: list[Outcome] = []
         self._taken: Counter[int] = Counter()
-        self._newest: dict[int, _Entry] = {}
+        self._newest: dict[int, int] = {}  # tick
+        self._newest_grey: dict[int, NDArray[np.uint8]] = {}
         self._received = 0
         self._fused = 0
         self._refused: Counter[Refusal] = Counter()
@@ -112,6 +115,37 @@ class PlaneSweepReconstructor:
             memory_bytes=self._volume.size_bytes + kept,
         )
 
+    @property
+    def lookback(self) -> int:
+        return VIEWS_KEPT
+
+    def state(self) -> State:
+        self._fuse_due()
+        waiting = [*self._unswept, *(entry for entry, _ in self._unfused)]
+        return {
+            **self._volume.state(),
+            "waiting": np.array([(entry.drone, entry.tick) for entry in waiting], np.int64).reshape(-1, 2),
+            "newest": np.array(sorted(self._newest.items()), np.int64).reshape(-1, 2),
+            "fused": np.array(self._fused),
+            "refused": np.array([self._refused[reason] for reason in get_args(Refusal)]),
+        }
+
+    def restore(self, state: State, recent: Iterable[Keyframe]) -> None:
+        self._volume.restore(state)
+        for keyframe in recent:
+            self._admit(keyframe)
+        waiting = set(map(tuple, state["waiting"].tolist()))
+        known = [entry for entry in self._unswept if (entry.drone, entry.tick) not in waiting]
+        self._unswept = [entry for entry in self._unswept if (entry.drone, entry.tick) in waiting]
+        for entry in known:  # without depth they could not confirm that of the waiting ones
+            if self._taken[entry.drone] - entry.rank <= RESWEPT:
+                self._sweep(entry)
+                entry.sources = ()
+        self._newest.update(state["newest"].tolist())
+        self._fused = int(state["fused"])
+        self._refused = +Counter(dict(zip(get_args(Refusal), state["refused"].tolist(), strict=True)))  # without zeros
+        self._received = self._fused + self._refused.total() + len(self._unswept)
+
     def _admit(self, keyframe: Keyframe) -> Outcome:
         """Keep what later steps need of a keyframe, unless it is of no use."""
         self._received += 1
@@ -119,8 +153,9 @@ class PlaneSweepReconstructor:
         camera = keyframe.intrinsics.scaled_to(self._width, self._height)
         view = View(to_grey(color), keyframe.position, keyframe.rotation, camera)
         span = depth_range(view, self._box, self._settings.truncation_m)
-        last = self._newest.get(keyframe.drone)
-        if last and (keyframe.tick <= last.tick or np.array_equal(view.grey, last.view.grey)):
+        last = self._newest_grey.get(keyframe.drone)
+        is_old = keyframe.tick <= self._newest.get(keyframe.drone, -1)
+        if is_old or (last is not None and np.array_equal(view.grey, last)):
             return self._refuse(keyframe, "repeated")
         if contrast(view.grey) < CONTRAST_MIN:
             return self._refuse(keyframe, "featureless")
@@ -130,14 +165,15 @@ class PlaneSweepReconstructor:
             return self._refuse(keyframe, "off_target")
         entry = _Entry(keyframe.drone, keyframe.sequence, keyframe.tick, self._taken[keyframe.drone], view, color, span)
         self._taken[keyframe.drone] += 1
-        self._newest[keyframe.drone] = entry
+        self._newest[keyframe.drone] = keyframe.tick
+        self._newest_grey[keyframe.drone] = view.grey
         self._kept[self._index.add(view)] = entry
         self._unswept.append(entry)
         return Outcome(keyframe.drone, keyframe.sequence, "waiting")
 
     def _schedule(self, everything: bool = False) -> None:
         """Begin the depth maps that are due, and note what can be fused once they are there."""
-        now = max((entry.tick for entry in self._newest.values()), default=0)
+        now = max(self._newest.values(), default=0)
 
         def is_due(entry: _Entry, stages: int) -> bool:
             followed = self._taken[entry.drone] - 1 - entry.rank >= stages * LOOK_AHEAD
@@ -145,15 +181,21 @@ class PlaneSweepReconstructor:
 
         for entry in [entry for entry in self._unswept if is_due(entry, 1)]:
             self._unswept.remove(entry)
-            entry.sources = self._sources(entry.view, entry.span)
-            if not entry.sources:
+            depth = self._sweep(entry)
+            if depth is None:
                 self._decided.append(self._refuse(entry, "no_overlap"))
-                continue
-            views = [source.view for source in entry.sources]
-            entry.depth = self._pool.submit(self._estimator.estimate, entry.view, views, entry.span)
-            self._unfused.append((entry, entry.depth))
+            else:
+                self._unfused.append((entry, depth))
         self._due += [swept for swept in self._unfused if is_due(swept[0], 2)]
         self._unfused = [swept for swept in self._unfused if not is_due(swept[0], 2)]
+
+    def _sweep(self, entry: _Entry) -> Future[DepthMap] | None:
+        """Begin a depth map; None if there is nothing to compare with."""
+        entry.sources = self._sources(entry.view, entry.span)
+        if entry.sources:
+            views = [source.view for source in entry.sources]
+            entry.depth = self._pool.submit(self._estimator.estimate, entry.view, views, entry.span)
+        return entry.depth
 
     def _sources(self, view: View, span: DepthRange) -> tuple[_Entry, ...]:
         depth = min(TYPICAL_SHARE * span.typical, self._settings.farthest_m)

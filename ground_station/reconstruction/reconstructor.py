@@ -6,9 +6,9 @@ therefore reports two kinds of outcome, of the keyframes just given and of earli
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, Protocol, TypeAlias
+from typing import Any, Final, Literal, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,9 @@ Refusal: TypeAlias = Literal["repeated", "featureless", "blurred", "off_target",
 """``repeated``: not newer than the drone's last, or the same image again (a frozen camera would ruin the map).
 ``featureless``: black, white or covered. ``off_target``: looks past the box to be mapped. ``no_overlap``: no other
 keyframe shows the same place from a useful angle. ``no_depth``: compared, but no depth that two views agree on."""
+
+State: TypeAlias = Mapping[str, NDArray[Any]]
+"""What a reconstructor has to know again after a restart, beside its newest keyframes: arrays of its own choice."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,6 +110,24 @@ class Reconstructor(Protocol):
 
     def statistics(self) -> Statistics: ...
 
+    @property
+    def lookback(self) -> int:
+        """How many of the newest keyframes `restore` needs to see again."""
+        ...
+
+    def state(self) -> State:
+        """For a checkpoint. The arrays are the caller's."""
+        ...
+
+    def restore(self, state: State, recent: Iterable[Keyframe]) -> None:
+        """Make a new reconstructor go on where another was: the mesh is the same, and who waited waits again.
+
+        ``recent`` are the newest keyframes, `lookback` of them, that the other was given before ``state`` was taken,
+        oldest first. Those that are missing cost views to compare with, and those of them that waited are lost.
+        Raises `ReconstructionError` if the state is another mission's.
+        """
+        ...
+
 
 class NullReconstructor:
     """Makes no map: missions that only fly."""
@@ -126,3 +147,13 @@ class NullReconstructor:
 
     def statistics(self) -> Statistics:
         return Statistics(self._received, self._received, 0, {}, 0)
+
+    @property
+    def lookback(self) -> int:
+        return 0
+
+    def state(self) -> State:
+        return {"received": np.array(self._received)}
+
+    def restore(self, state: State, recent: Iterable[Keyframe]) -> None:  # noqa: ARG002  # the protocol's
+        self._received = int(state["received"])

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from ground_station.reconstruction.backends import make_reconstructor
 from ground_station.reconstruction.reconstructor import Keyframe, Mesh, Outcome, Reconstructor
@@ -164,6 +165,59 @@ def test_keyframes_may_follow_a_flush(reconstructor: Reconstructor, flight: list
     assert_sound(reconstructor.mesh())
 
 
+def restart(old: Reconstructor, backend: str, given: Sequence[Keyframe], workers: int = 1) -> Reconstructor:
+    """A new reconstructor in the state of one that was given those keyframes."""
+    new = make_reconstructor(mission(backend, workers))
+    new.restore(old.state(), iter(given[max(0, len(given) - old.lookback) :]))
+    return new
+
+
+@pytest.mark.parametrize("backend", ["plane_sweep", "none"])
+@pytest.mark.parametrize("cut", [0, 2, 7, 16, 2 * LEG])
+def test_a_restored_reconstructor_has_the_same_mesh_and_takes_up_where_the_other_was(
+    flight: list[Keyframe], backend: str, cut: int
+) -> None:
+    old = make_reconstructor(mission(backend))
+    decided = {
+        (outcome.drone, outcome.sequence)
+        for start in range(0, cut, 2)
+        for outcome in old.add(flight[start : min(start + 2, cut)])
+        if outcome.state != "waiting"
+    }
+    new = restart(old, backend, flight[:cut])
+    assert contents(new.mesh()) == contents(old.mesh())
+    assert new.statistics() == old.statistics()
+
+    again = {(one.drone, one.sequence): one for one in fly(new, flight[cut:]) if one.state != "waiting"}
+    at_state = {(one.drone, one.sequence) for one in old.add([]) if one.state != "waiting"}  # fused by `state` itself
+    assert decided | at_state | set(again) == {(one.drone, one.sequence) for one in flight}
+    assert not (decided | at_state) & set(again), "nothing is fused twice"
+    assert new.statistics().received == len(flight)
+    assert new.statistics().waiting == 0
+    assert_sound(new.mesh())
+
+
+def test_a_state_belongs_to_the_caller(reconstructor: Reconstructor, flight: list[Keyframe]) -> None:
+    fly(reconstructor, flight[:16])
+    state = reconstructor.state()
+    before = {name: array.tobytes() for name, array in state.items()}
+    fly(reconstructor, flight[16:])
+    assert {name: array.tobytes() for name, array in state.items()} == before
+
+
+def test_keyframes_given_again_after_a_restart_are_not_taken_twice(
+    reconstructor: Reconstructor, request: pytest.FixtureRequest, flight: list[Keyframe]
+) -> None:
+    backend = request.node.callspec.params["reconstructor"]
+    for start in range(0, 12, 2):
+        reconstructor.add(flight[start : start + 2])
+    new = restart(reconstructor, backend, flight[:12])
+    before = contents(new.mesh())
+    outcomes = new.add(flight[:12])[:12]
+    assert backend == "none" or {outcome.reason for outcome in outcomes} == {"repeated"}
+    assert contents(new.mesh()) == before
+
+
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
@@ -219,6 +273,8 @@ def test_the_mesh_does_not_depend_on_workers_or_on_when_it_was_asked_for(boxes: 
         reconstructor.add(flight[start : start + 2])
         if start % 3 == 2:
             reconstructor.mesh()
+        if start % 8 == 6:
+            reconstructor.state()
     reconstructor.mesh()
     reconstructor.flush()
     assert contents(reconstructor.mesh()) == contents(boxes)
@@ -229,6 +285,49 @@ def test_the_map_grows_before_the_flight_ends(flight: list[Keyframe]) -> None:
     for start in range(0, 20, 2):
         reconstructor.add(flight[start : start + 2])
     assert len(reconstructor.mesh().faces) > 1000
+
+
+def test_a_map_across_a_restart_is_as_good_as_one_without(boxes: Mesh, flight: list[Keyframe]) -> None:
+    old = make_reconstructor(mission())
+    for start in range(0, 14, 2):
+        old.add(flight[start : start + 2])
+    new = restart(old, "plane_sweep", flight[:14])
+    fly(new, flight[14:])
+    found, expected = new.mesh(), boxes
+    assert len(found.vertices) == pytest.approx(len(expected.vertices), rel=0.01)
+    distances, _ = cKDTree(expected.vertices).query(found.vertices)
+    assert np.quantile(distances, 0.95) < 0.005
+
+
+def test_two_restarts_from_the_same_checkpoint_make_the_same_map(flight: list[Keyframe]) -> None:
+    old = make_reconstructor(mission())
+    for start in range(0, 14, 2):
+        old.add(flight[start : start + 2])
+    meshes = []
+    for workers in (1, 2):
+        new = restart(old, "plane_sweep", flight[:14], workers)
+        fly(new, flight[14:])
+        meshes.append(contents(new.mesh()))
+    assert meshes[0] == meshes[1]
+
+
+def test_after_a_restart_without_the_newest_keyframes_the_map_still_grows(flight: list[Keyframe]) -> None:
+    old = make_reconstructor(mission())
+    for start in range(0, 14, 2):
+        old.add(flight[start : start + 2])
+    new = make_reconstructor(mission())
+    new.restore(old.state(), [])
+    assert new.statistics().waiting == 0
+    (refused,) = new.add([flight[12]])
+    assert refused.reason == "repeated", "what is as old as the newest before the restart"
+    fly(new, flight[14:])
+    assert len(new.mesh().faces) > len(old.mesh().faces)
+
+
+def test_a_state_of_another_box_is_refused() -> None:
+    larger = mission().model_copy(update={"target": Target(lower_m=(-1, -1, 0), upper_m=(1, 1, 1.8))})
+    with pytest.raises(ReconstructionError, match="does not fit"):
+        make_reconstructor(larger).restore(make_reconstructor(mission()).state(), [])
 
 
 def reasons(outcomes: Sequence[Outcome]) -> dict[int, str]:

@@ -81,3 +81,45 @@ def test_a_depth_map_without_any_depth_changes_nothing(volume: Volume) -> None:
 def test_a_volume_beyond_all_memory_is_refused_by_name() -> None:
     with pytest.raises(ReconstructionError, match="voxel_m"):
         Volume(Box(lower_m=(-50, -50, 0), upper_m=(50, 50, 20)), voxel_m=0.005, truncation_m=0.01)
+
+
+def seen_from_two_poses(volume: Volume) -> None:
+    fuse_plane(volume, np.array([0.0, 0.0, 1.5]), camera_rotation(0.0, np.pi / 2))
+    fuse_plane(volume, np.array([-0.4, 0.1, 1.4]), camera_rotation(0.3, 1.2), shade=40, offset_m=0.013)
+
+
+def test_a_volume_is_restored_bit_by_bit_and_smaller_than_it_is(volume: Volume) -> None:
+    seen_from_two_poses(volume)
+    state = volume.state()
+    assert sum(array.nbytes for array in state.values()) < 0.5 * volume.size_bytes
+    other = Volume(Box(lower_m=(-1, -1, 0), upper_m=(1, 1, 1)), voxel_m=0.025, truncation_m=0.05)
+    fuse_plane(other, np.array([0.6, 0.0, 0.9]), camera_rotation(1.0, np.pi / 2))  # is forgotten
+    other.restore(state)
+    for one, two in ((volume.distance, other.distance), (volume.weight, other.weight), (volume.color, other.color)):
+        np.testing.assert_array_equal(one, two)
+
+
+def test_a_coloured_voxel_as_far_as_the_truncation_is_restored_with_its_colour(volume: Volume) -> None:
+    volume.weight[3, 4, 5] = 1.0
+    volume.distance[3, 4, 5] = volume.truncation
+    volume.color[3, 4, 5] = (0, 0, 9)
+    other = Volume(Box(lower_m=(-1, -1, 0), upper_m=(1, 1, 1)), voxel_m=0.025, truncation_m=0.05)
+    other.restore(volume.state())
+    assert other.color[3, 4, 5].tolist() == [0, 0, 9]
+    assert other.distance[3, 4, 5] == np.float32(volume.truncation)
+
+
+def test_a_state_does_not_change_when_the_map_goes_on(volume: Volume) -> None:
+    seen_from_two_poses(volume)
+    state = volume.state()
+    before = {name: array.tobytes() for name, array in state.items()}
+    seen_from_two_poses(volume)
+    assert {name: array.tobytes() for name, array in state.items()} == before
+
+
+def test_a_state_of_another_volume_is_refused(volume: Volume) -> None:
+    state = volume.state()
+    with pytest.raises(ReconstructionError, match="does not fit"):
+        Volume(Box(lower_m=(-1, -1, 0), upper_m=(1, 1, 2)), voxel_m=0.025, truncation_m=0.05).restore(state)
+    with pytest.raises(ReconstructionError, match="does not fit"):
+        volume.restore({**state, "weight": np.ones(3, np.float32)})

@@ -6,7 +6,7 @@ from rich.console import Console
 
 from deploy.progress import LiveDisplay, PlainDisplay
 from protocol.guard import ROOT
-from protocol.messages import DroneStatus, Status
+from protocol.messages import DroneStatus, ReplicaState, Status
 from protocol.mission_file import load_mission
 
 DEMO = load_mission(ROOT / "missions" / "demo.toml")
@@ -36,6 +36,10 @@ def status(time_s: float, activity: str = "mapping") -> Status:
         f_score_objects=0.32,
         keyframes=100,
         dropped=1,
+        replica=ReplicaState(tick=1, epoch=1, next_jump=7, missing=0, repaired=0, lost=0),
+        refused=0,
+        unwritten=0,
+        loop_lag_s=0.002,
         keyframes_per_s=8.0,
         jumps=7,
         min_separation_m=1.02,

@@ -10,15 +10,18 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
+from faults.disk import FullDisk, dies, in_child
 from ground_station.evaluation import Score, Scores
-from ground_station.results import Metrics, RunFolder, mesh_sha256, versions
-from protocol.errors import MissionError
+from ground_station.mesh_files import mesh_sha256
+from ground_station.results import Metrics, RunFolder, versions
+from protocol.errors import MissionError, StorageError
 from protocol.mission import Drone, Mission
 
 MISSION = Mission(
@@ -166,6 +169,12 @@ def test_a_folder_that_holds_a_flight_is_refused_and_left_as_it_is(folder: RunFo
     assert (folder.path / "metrics.csv").read_bytes() == before
 
 
+def test_a_folder_in_which_nothing_was_flown_yet_can_be_used(folder: RunFolder) -> None:
+    folder.close()
+    RunFolder(folder.path, MISSION).close()
+    assert rows(folder.path / "metrics.csv") == []
+
+
 def test_equal_runs_leave_equal_bytes(tmp_path: Path) -> None:
     written = []
     for name in ("one", "other"):
@@ -258,3 +267,238 @@ os.kill(os.getpid(), signal.SIGKILL)
     survived = rows(tmp_path / "run" / "metrics.csv")
     assert [int(row["keyframes"]) for row in survived] == list(range(100))
     assert math.isclose(float(survived[-1]["time_s"]), 99 / 20)
+
+
+# --- after a crash ---------------------------------------------------------------------------------------------------
+
+
+def crash(run: RunFolder) -> RunFolder:
+    """The folder as the next process opens it: one that wrote a journal and was killed."""
+    run.close()
+    (run.path / "journal").touch()
+    return RunFolder(run.path, MISSION)
+
+
+def ticks(path: Path) -> list[int]:
+    return [int(row["tick"]) for row in rows(path / "metrics.csv")]
+
+
+def test_after_a_crash_rows_and_trajectories_go_on(folder: RunFolder) -> None:
+    fly(folder, 0, 6)
+    folder.record_metrics(metrics(5))
+    folder.checkpoint()
+    fly(folder, 6, 9)
+    folder.record_metrics(metrics(8))
+
+    again = crash(folder)
+    fly(again, 15, 20)
+    again.record_metrics(metrics(20))
+    summary = finish(again, 20)
+    again.close()
+
+    assert ticks(again.path) == [5, 8, 20]
+    with np.load(again.path / "trajectories.npz") as flown:
+        assert flown["tick"].tolist() == [*range(6), *range(15, 20)], "what no checkpoint held is a gap"
+        assert flown["poses"].shape == (11, 2, 5)
+        assert np.isfinite(flown["poses"]).all()
+        assert flown["fallback"][4, 1] == "infeasible"
+    assert summary["fallbacks"] == {"1": 0, "4": 3}, "in ticks 0, 4 and 16"
+
+
+@pytest.mark.parametrize("set_aside", [False, True])
+def test_the_smallest_separation_outlives_a_crash(folder: RunFolder, set_aside: bool) -> None:
+    for tick, distance in enumerate([5.0, 1.2, 5.0]):
+        folder.record_tick(tick, tick / 20, {1: (0, 0, 1, 0, 1), 4: (distance, 0, 1, 0, 1)}, {}, {}, {})
+    folder.record_metrics(metrics(2))
+    again = crash(folder)
+    if set_aside:
+        (again.path / "journal").rename(again.path / "journal.damaged-1")
+        again.close()
+        again = RunFolder(again.path, MISSION)
+    assert again.min_separation_m == 1.2
+    again.record_tick(9, 0.45, {1: (0, 0, 1, 0, 1), 4: (4.0, 0, 1, 0, 1)}, {}, {}, {})
+    again.record_metrics(metrics(9))
+    assert finish(again)["min_separation_m"] == 1.2
+    assert rows(again.path / "metrics.csv")[-1]["min_separation_m"] == "4.0"
+    again.close()
+
+
+def test_a_tick_that_has_a_row_from_before_the_crash_gets_no_second_one(folder: RunFolder) -> None:
+    folder.record_metrics(metrics(20))
+    again = crash(folder)
+    for tick in (19, 20, 21):
+        again.record_metrics(metrics(tick))
+    again.close()
+    assert ticks(again.path) == [20, 21]
+
+
+def test_a_row_torn_at_any_byte_is_written_over_after_the_crash(folder: RunFolder) -> None:
+    for tick in (5, 6):
+        folder.record_metrics(metrics(tick))
+    path = folder.path / "metrics.csv"
+    whole = path.read_bytes()
+    header = whole.index(b"\n") + 1
+    (folder.path / "journal").touch()
+    folder.close()
+    for size in range(len(whole)):
+        path.write_bytes(whole[:size])
+        again = RunFolder(folder.path, MISSION)
+        again.record_metrics(metrics(7))
+        again.close()
+        kept = [5, 6][: whole[header:size].count(b"\n")]
+        assert ticks(folder.path) == [*kept, 7]
+
+
+def test_a_damaged_record_is_set_aside_and_the_flight_goes_on(
+    folder: RunFolder, caplog: pytest.LogCaptureFixture
+) -> None:
+    fly(folder, 0, 6)
+    folder.record_metrics(metrics(5))
+    folder.checkpoint()
+    damaged = {}
+    for name in ("metrics.csv", "trajectories.npz"):
+        content = bytearray((folder.path / name).read_bytes())
+        content[5 if name == "metrics.csv" else len(content) // 2] ^= 1
+        (folder.path / name).write_bytes(content)
+        damaged[f"{name}.damaged-1"] = bytes(content)
+
+    again = crash(folder)
+    fly(again, 6, 8)
+    again.record_metrics(metrics(8))
+    again.checkpoint()
+    again.close()
+
+    assert {name: (folder.path / name).read_bytes() for name in damaged} == damaged
+    assert [entry.levelname for entry in caplog.records] == ["ERROR", "ERROR"]
+    assert ticks(folder.path) == [8]
+    with np.load(folder.path / "trajectories.npz") as flown:
+        assert flown["tick"].tolist() == [6, 7]
+
+
+def test_trajectories_with_any_byte_changed_never_keep_the_ground_station_from_starting(folder: RunFolder) -> None:
+    fly(folder, 0, 3)
+    folder.record_metrics(metrics(2))
+    folder.checkpoint()
+    crash(folder).close()
+    path = folder.path / "trajectories.npz"
+    whole = path.read_bytes()
+    for place in range(0, len(whole), 7):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 0x55]) + whole[place + 1 :])
+        again = RunFolder(folder.path, MISSION)
+        fly(again, 3, 4)
+        again.checkpoint()
+        again.close()
+        with np.load(path) as flown:
+            assert flown["tick"].tolist() in ([0, 1, 2, 3], [3])
+
+
+def test_a_finished_flight_is_not_gone_on_with(folder: RunFolder) -> None:
+    fly(folder, 0, 6)
+    folder.record_metrics(metrics(6))
+    finish(folder)
+    with pytest.raises(MissionError, match="holds a flight already"):
+        crash(folder)
+
+
+def test_a_process_that_dies_anywhere_leaves_a_folder_that_can_be_gone_on_with(tmp_path: Path) -> None:
+    def record(path: Path) -> None:
+        run = RunFolder(path, MISSION)
+        for tick in (1, 2):
+            fly(run, tick, tick + 1)
+            run.record_metrics(metrics(tick))
+            run.checkpoint()
+
+    step, recorded = 0, []
+    while True:
+        path = tmp_path / str(step)
+        path.mkdir()
+        (path / "journal").touch()
+        died = dies(lambda path=path: record(path), step)  # type: ignore[misc]
+        again = RunFolder(path, MISSION)
+        found = ticks(path)
+        assert found == [1, 2][: len(found)]
+        again.checkpoint()
+        again.close()
+        with np.load(path / "trajectories.npz") as flown:
+            kept = flown["tick"].tolist()
+        assert kept == [1, 2][: len(kept)]
+        recorded.append((len(found), len(kept)))
+        if not died:
+            break
+        step += 1
+    assert recorded == sorted(recorded)
+    assert set(recorded) == {(0, 0), (1, 0), (1, 1), (2, 1), (2, 2)}
+
+
+# --- a disk that refuses ---------------------------------------------------------------------------------------------
+
+
+def test_rows_that_a_full_disk_refused_are_written_once_there_is_room(
+    folder: RunFolder, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder.record_metrics(metrics(1))
+    disk = folder._metrics._file._file
+    folder._metrics._file._file = FullDisk(disk, 30)  # type: ignore[assignment]
+    for tick in range(2, 12):
+        folder.record_metrics(metrics(tick))
+    assert folder.refused_writes == 10
+    assert ticks(folder.path)[:1] == [1]
+    folder._metrics._file._file = disk
+    folder.record_metrics(metrics(12))
+    assert ticks(folder.path) == list(range(1, 13))
+    assert [entry.levelname for entry in caplog.records] == ["ERROR", "WARNING"]
+
+
+def test_a_checkpoint_that_the_disk_refused_is_made_up_for_by_the_next(folder: RunFolder) -> None:
+    fly(folder, 0, 3)
+    folder.checkpoint()
+    whole = (folder.path / "trajectories.npz").read_bytes()
+
+    def refused() -> None:
+        fly(folder, 3, 6)
+        folder.checkpoint()
+        assert folder.refused_writes == 1
+
+    assert in_child(refused, largest_file=100) == 0
+    assert (folder.path / "trajectories.npz").read_bytes() == whole
+    assert not list(folder.path.glob(".*draft"))
+    fly(folder, 3, 6)
+    folder.checkpoint()
+    with np.load(folder.path / "trajectories.npz") as flown:
+        assert flown["tick"].tolist() == list(range(6))
+
+
+def test_results_that_the_disk_refuses_at_the_end_are_an_error_that_names_the_file(folder: RunFolder) -> None:
+    fly(folder, 0, 3)
+
+    def end() -> None:
+        with pytest.raises(StorageError, match=r"mesh\.ply: File too large"):
+            folder.write_mesh(VERTICES, FACES, COLOURS)
+        with pytest.raises(StorageError, match="File too large"):
+            finish(folder)
+        for tick in range(200):
+            folder.record_metrics(metrics(tick))
+        assert folder.refused_writes > 0
+        (folder.path / "trajectories.npz").unlink(missing_ok=True)
+
+    assert in_child(end, largest_file=300) == 0
+    assert not (folder.path / "summary.json").exists()
+    finish(folder)
+
+
+def test_a_folder_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(StorageError, match="Not a directory"):
+        RunFolder(tmp_path / "file" / "run", MISSION)
+
+
+def test_a_checkpoint_may_be_written_while_ticks_are_recorded(folder: RunFolder) -> None:
+    fly(folder, 0, 1)
+    with ThreadPoolExecutor(1) as other:
+        for start in range(1, 2001, 200):
+            writing = other.submit(folder.checkpoint)
+            fly(folder, start, start + 200)
+            writing.result()
+    folder.checkpoint()
+    with np.load(folder.path / "trajectories.npz") as flown:
+        assert flown["tick"].tolist() == list(range(2001))

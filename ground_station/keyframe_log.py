@@ -1,0 +1,98 @@
+"""All keyframes of a flight on disk: the map can be made again from them, after a crash or with another method.
+
+One record (`ground_station.record_file`) for each, as it travelled. Keyframes are not synced: a killed process loses
+none, a power cut the newest. And a disk that refuses them does not stop the flight.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Self
+
+from ground_station.durable import DiskFaults
+from ground_station.record_file import HEAD_BYTES, GrowingFile, lay_out, record
+from protocol.errors import MessageError, StorageError
+from protocol.messages import Keyframe
+from protocol.wire import decode, encode
+
+log = logging.getLogger(__name__)
+
+KEYFRAMES_FILE = "keyframes"
+
+
+class KeyframeLog:
+    """Positions in it are bytes from its start. Used by one thread at a time."""
+
+    def __init__(self, path: Path) -> None:
+        """Open or create; the end that a crash tore is written over, and damage is told and left where it is.
+
+        Raises:
+            StorageError: it cannot be opened.
+        """
+        self._path = path
+        self._faults = DiskFaults(str(path))
+        try:
+            self._file = GrowingFile(path)
+        except OSError as error:
+            raise StorageError(f"{path}: {error.strerror}") from error
+        with self._file.contents() as data:
+            layout = lay_out(data)
+        self._file.end = layout.end
+        self.count = len(layout.contents)
+        """Keyframes that it holds."""
+        for damaged in layout.damaged:
+            log.error("%s: damaged from byte %d to %d: keyframes are lost", path, damaged.first, damaged.last)
+
+    @property
+    def end(self) -> int:
+        """Where the next keyframe goes."""
+        return self._file.end
+
+    @property
+    def lost_records(self) -> int:
+        """Keyframes that the disk refused; the map has them all the same."""
+        return self._faults.count
+
+    def append(self, keyframe: Keyframe) -> None:
+        try:
+            self._file.append(record(encode(keyframe)))
+        except OSError as error:
+            self._faults.refused(error)
+        else:
+            self.count += 1
+            self._faults.took()
+
+    def sync(self) -> None:
+        """Put on disk what is appended: before something else on disk speaks of its positions.
+
+        Raises:
+            StorageError: the disk refuses it.
+        """
+        try:
+            self._file.sync()
+        except OSError as error:
+            raise StorageError(f"{self._path}: {error.strerror}") from error
+
+    def read(self, first: int, last: int) -> Iterator[tuple[int, Keyframe]]:
+        """The keyframes from position ``first`` to before ``last``, each with its own position; damaged ones are
+        left out. Nothing may be appended meanwhile."""
+        with self._file.contents() as data:
+            for content in lay_out(data, first).contents:
+                position = content.first - HEAD_BYTES
+                if position >= last:
+                    return
+                try:
+                    yield position, decode(Keyframe, data[content.first : content.last])
+                except MessageError as error:
+                    log.warning("%s: keyframe at byte %d is left out: %s", self._path, position, error)
+
+    def close(self) -> None:
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

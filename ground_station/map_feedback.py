@@ -1,0 +1,164 @@
+"""Keyframes to jumps: hands images to the map's worker thread, looks at the map on time, and lets phi jump.
+
+The event loop never waits for the map, except in lockstep, where a jump is awaited when it is about to take effect: so
+the same mission gives the same jumps at the same ticks however fast the machine is.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TypeVar
+
+from ground_station.evaluation import Scores
+from ground_station.feedback import FeedbackSchedule
+from ground_station.jump_publisher import JumpPublisher
+from ground_station.mapper import Mapper, MapUpdate
+from protocol.messages import Keyframe
+from protocol.mission import Mission
+
+T = TypeVar("T")
+
+SCORE_PERIOD_S = 10.0
+"""Mission time between two live F-scores."""
+LEAD_TICKS = 8
+"""How far ahead of this process the simulator may fly in lockstep; in real time, how long a jump gets to travel."""
+KEYFRAME_BACKLOG = 200
+"""Keyframes that may wait for the map in real time; beyond it the newest are dropped and counted."""
+
+
+@dataclass(slots=True)
+class _Update:
+    """A map update that is being computed."""
+
+    effective: int
+    importance: float
+    task: asyncio.Task[MapUpdate]
+
+
+class MapFeedback:
+    def __init__(self, mission: Mission, mapper: Mapper, jumps: JumpPublisher, *, lockstep: bool) -> None:
+        self._mission, self._mapper, self._jumps, self._lockstep = mission, mapper, jumps, lockstep
+        self._schedule = FeedbackSchedule(mission.feedback, mission.tick_s)
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="mapper")
+        self._adding: set[asyncio.Task[None]] = set()
+        self._updates: deque[_Update] = deque()
+        self._received: deque[Keyframe] = deque()
+        self._newest: dict[int, int] = {}
+        self._scored_at = -math.inf
+        self.received = 0
+        self.handed = 0
+        """Keyframes given to the map; in lockstep the simulator may be some ticks and images ahead."""
+        self.mapped = 0
+        self.dropped = 0
+        """Keyframes that were lost on the way or for which there was no time."""
+        self.scores: Scores | None = None
+
+    @property
+    def backlog(self) -> int:
+        return self.handed - self.mapped
+
+    @property
+    def unused(self) -> int:
+        """Keyframes that did not make it into the map."""
+        return self.dropped + self._mapper.refused
+
+    def resume(self, restore: Callable[[], None], *, sent: int) -> None:
+        """Go on after a restart: ``restore`` the map first; ``sent`` keyframes were sent so far, in all."""
+        self.handed = self.mapped = self._mapper.taken
+        self.received = sent
+        self.dropped = max(0, sent - self.handed)
+        task = asyncio.create_task(self.on_worker(restore))
+        self._adding.add(task)
+        task.add_done_callback(self._adding.discard)
+
+    def hear(self, keyframe: Keyframe) -> None:
+        """Also notices those before it that never came."""
+        self.received += 1
+        newest = self._newest.get(keyframe.drone, keyframe.sequence - 1)
+        if keyframe.sequence < newest:  # counted as lost when a later one came first
+            self.dropped = max(0, self.dropped - 1)
+        else:
+            self.dropped += max(0, keyframe.sequence - newest - 1)
+            self._newest[keyframe.drone] = keyframe.sequence
+        self._received.append(keyframe)
+
+    def hand_over(self, tick: int) -> None:
+        """Hand what was photographed before ``tick`` to the map, in an order that does not depend on arrival."""
+        ready = sorted(
+            (keyframe for keyframe in self._received if keyframe.tick < tick),
+            key=lambda keyframe: (keyframe.tick, keyframe.drone),
+        )
+        self._received = deque(keyframe for keyframe in self._received if keyframe.tick >= tick)
+        if not ready:
+            return
+        if not self._lockstep and self.backlog >= KEYFRAME_BACKLOG:
+            self.dropped += len(ready)
+            return
+        self.handed += len(ready)
+        task = asyncio.create_task(self._add(ready))
+        self._adding.add(task)
+        task.add_done_callback(self._adding.discard)
+
+    async def _add(self, keyframes: list[Keyframe]) -> None:
+        await self.on_worker(lambda: self._mapper.add(keyframes))
+        self.mapped += len(keyframes)
+
+    async def on_worker(self, work: Callable[[], T]) -> T:
+        """Do ``work`` on the thread that owns the map, after all that was given to it before."""
+        return await asyncio.get_running_loop().run_in_executor(self._worker, work)
+
+    def look(self, tick: int, importance: float) -> None:
+        """Begin a map update if one is due at ``tick``, with J at that tick."""
+        if not self._schedule.is_due(tick):
+            return
+        time_s = tick * self._mission.tick_s
+        scored = time_s - self._scored_at >= SCORE_PERIOD_S
+        if scored:
+            self._scored_at = time_s
+        task = asyncio.create_task(self.on_worker(lambda: self._mapper.update(scored=scored)))
+        self._updates.append(_Update(self._schedule.effective_tick(tick), importance, task))
+
+    async def settle(self, tick: int) -> None:
+        """Turn finished updates into jumps.
+
+        In lockstep exactly when one is about to take effect, and then it is waited for: what is recorded does not
+        depend on how fast the machine was.
+        """
+        while self._updates:
+            update = self._updates[0]
+            if not (update.effective <= tick + 1 if self._lockstep else update.task.done()):
+                return
+            result = await update.task
+            self._updates.popleft()
+            self.scores = result.scores or self.scores
+            increments = self._schedule.increments(result.change, update.importance)
+            if increments is not None:
+                effective = update.effective if self._lockstep else max(update.effective, tick + LEAD_TICKS)
+                await self._jumps.publish(increments, effective)
+
+    def settled_until(self, tick: int) -> int:
+        """The last tick for which no further jump can come, said at ``tick``; at least ``tick`` + 1 in lockstep."""
+        if not self._lockstep:
+            return tick + LEAD_TICKS - 1
+        done = min(self._schedule.settled_after(tick), tick + LEAD_TICKS)
+        if self._updates:
+            done = min(done, self._updates[0].effective - 1)
+        return max(done, tick + 1)
+
+    async def finish(self) -> MapUpdate:
+        """The complete map, scored."""
+        for update in self._updates:
+            update.task.cancel()
+        if self._adding:
+            await asyncio.wait(self._adding)
+        result = await self.on_worker(self._mapper.finish)
+        self.scores = result.scores or self.scores
+        return result
+
+    def close(self) -> None:
+        self._worker.shutdown(wait=False, cancel_futures=True)

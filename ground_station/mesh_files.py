@@ -1,0 +1,51 @@
+"""The map as files: PLY in the world frame, GLB with y up as glTF demands, and a hash to compare maps by."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+GLB_MATERIAL = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}, "doubleSided": True}
+"""Without it viewers show glTF's default, a dark metal."""
+
+Vertices: TypeAlias = NDArray[np.float32]
+Faces: TypeAlias = NDArray[np.int32]
+Colours: TypeAlias = NDArray[np.uint8]
+
+
+def mesh_sha256(vertices: Vertices, faces: Faces) -> str:
+    """Hash over the vertices as little-endian float32, then the faces as little-endian int32."""
+    digest = hashlib.sha256(np.ascontiguousarray(vertices, dtype="<f4").tobytes())
+    digest.update(np.ascontiguousarray(faces, dtype="<i4").tobytes())
+    return digest.hexdigest()
+
+
+def ply(vertices: Vertices, faces: Faces, colours: Colours) -> bytes:
+    return _exported(vertices, faces, colours, "ply")
+
+
+def _exported(vertices: Vertices, faces: Faces, colours: Colours, file_type: str, **options: Any) -> bytes:
+    import trimesh
+
+    content = io.BytesIO()
+    mesh = trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False)
+    mesh.export(content, file_type=file_type, **options)
+    return content.getvalue()
+
+
+def glb(vertices: Vertices, faces: Faces, colours: Colours) -> bytes:
+    """glTF 2.0: y up, right-handed, and vertex colours linear in light rather than sRGB (sections 3.4, 3.7.2.1)."""
+
+    def add_material(tree: dict[str, Any]) -> None:
+        tree["materials"] = [GLB_MATERIAL]
+        tree["meshes"][0]["primitives"][0]["material"] = 0
+
+    upright = np.column_stack([vertices[:, 0], vertices[:, 2], -vertices[:, 1]])
+    level = np.arange(256) / 255
+    linear = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
+    shown = np.round(255 * linear).astype(np.uint8)[colours]
+    return _exported(upright, faces, shown, "glb", tree_postprocessor=add_material)

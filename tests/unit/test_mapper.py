@@ -1,0 +1,252 @@
+"""What the map has taken in is there again after a crash, and nothing that changed before it makes phi jump again."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from ground_station.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from ground_station.keyframe_log import KeyframeLog
+from ground_station.mapper import Mapper, MapState
+from protocol.errors import StorageError
+from protocol.field import VirtualField
+from protocol.geometry import camera_rotation
+from protocol.messages import Keyframe
+from protocol.mission import Camera, Drone, Feedback, Mission, Reconstruction, Target
+
+MISSION = Mission(
+    target=Target(lower_m=(-1, -1, 0), upper_m=(1, 1, 0.4)),
+    camera=Camera(width_px=160, height_px=90),
+    reconstruction=Reconstruction(sweep_width_px=96, depth_planes=32, nearest_m=0.6, farthest_m=2.5, workers=1),
+    feedback=Feedback(spacing_m=0.2),
+    drones=(Drone(id=1, start=(0, 0, 2, 0, 1.4)),),
+)
+FIELD = VirtualField.of(MISSION.target)
+HEIGHT_M, STEP_M, PATCH_PX = 1.4, 0.13, 4
+LEG = 14
+CUT = 8
+"""Keyframes at the checkpoint."""
+
+
+def fly() -> list[Keyframe]:
+    """A drone looks straight down on a randomly patterned floor and moves sideways."""
+    camera = MISSION.camera.intrinsics()
+    rotation = camera_rotation(0.0, np.pi / 2)
+    step_px = round(STEP_M * camera.fx / HEIGHT_M)
+    width = camera.width + LEG * step_px
+    patches = np.random.default_rng(0).integers(0, 255, (camera.height // PATCH_PX + 1, width // PATCH_PX + 1, 3))
+    floor = patches.repeat(PATCH_PX, axis=0).repeat(PATCH_PX, axis=1).astype(np.uint8)
+    keyframes = []
+    for number in range(LEG):
+        view = floor[: camera.height, number * step_px : number * step_px + camera.width]
+        place = np.array([0.0, 0.0, HEIGHT_M]) + rotation[:, 0] * step_px * HEIGHT_M / camera.fx * (number - LEG / 2)
+        keyframes.append(message(number, np.ascontiguousarray(view), place.tolist(), rotation.tolist()))
+    return keyframes
+
+
+def message(number: int, image: NDArray[np.uint8], place: Sequence[float], rows: Sequence[Sequence[float]]) -> Keyframe:
+    jpeg = io.BytesIO()
+    Image.fromarray(image).save(jpeg, "JPEG", quality=95)
+    camera = MISSION.camera.intrinsics()
+    return Keyframe.model_validate(
+        {
+            "drone": 1,
+            "sequence": number,
+            "tick": 10 * number,
+            "position": tuple(place),
+            "rotation": tuple(map(tuple, rows)),
+            "width": camera.width,
+            "height": camera.height,
+            **{name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy")},
+            "jpeg": jpeg.getvalue(),
+        }
+    )
+
+
+FLIGHT = fly()
+
+
+@dataclass
+class Station:
+    """One life of the ground station's map, in a folder that outlives it."""
+
+    folder: Path
+    mission: Mission = MISSION
+    lives: list[Station] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.lives.append(self)
+        self.log = KeyframeLog(self.folder / "keyframes")
+        self.mapper = Mapper(self.mission, FIELD, self.folder, self.log)
+
+    def add(self, keyframes: Sequence[Keyframe]) -> None:
+        for keyframe in keyframes:
+            self.mapper.add([keyframe])
+
+    def killed(self) -> Station:
+        """The next life."""
+        return Station(self.folder, self.mission, self.lives)
+
+    def faces(self) -> int:
+        return len(self.mapper.update(scored=False).mesh.faces)
+
+    def mesh(self) -> tuple[bytes, bytes]:
+        mesh = self.mapper.update(scored=False).mesh
+        return mesh.vertices.tobytes(), mesh.faces.tobytes()
+
+
+@pytest.fixture
+def station(tmp_path: Path) -> Iterator[Station]:
+    station = Station(tmp_path)
+    yield station
+    for life in station.lives:
+        life.log.close()
+
+
+def saved(folder: Path, state: MapState) -> MapState:
+    """``state`` by way of a checkpoint on disk."""
+    phi = np.zeros(FIELD.shape, np.float32)
+    save_checkpoint(folder, MISSION, Checkpoint(1, 2, 3, phi, state, {}))
+    found = load_checkpoint(folder, MISSION)
+    assert found is not None
+    return found.map
+
+
+def test_the_map_of_the_checkpoint_is_there_again(station: Station) -> None:
+    station.add(FLIGHT[:CUT])
+    state = saved(station.folder, station.mapper.state())
+    mesh = station.mesh()
+    assert station.faces() > 500
+    new = station.killed()
+    assert new.mapper.restore(state) == 0
+    assert new.mesh() == mesh
+    assert new.mapper.refused == station.mapper.refused
+
+
+def test_keyframes_from_after_the_checkpoint_are_mapped_again(station: Station) -> None:
+    station.add(FLIGHT[:CUT])
+    state = saved(station.folder, station.mapper.state())
+    station.add(FLIGHT[CUT:])
+    faces = station.faces()
+    new = station.killed()
+    assert new.mapper.restore(state) == LEG - CUT
+    assert new.faces() == pytest.approx(faces, rel=0.02)
+    assert len(new.mapper.finish().mesh.faces) == pytest.approx(len(station.mapper.finish().mesh.faces), rel=0.02)
+    assert new.log.count == new.mapper.taken == LEG, "none is logged again"
+
+
+def test_without_a_checkpoint_the_whole_map_is_made_anew(station: Station) -> None:
+    station.add(FLIGHT)
+    mesh = station.mesh()
+    new = station.killed()
+    assert new.mapper.restore(None) == LEG
+    assert new.mesh() == mesh
+
+
+def test_one_life_after_another_ends_with_the_map_of_a_single_life(station: Station, tmp_path: Path) -> None:
+    (tmp_path / "single").mkdir()
+    single = Station(tmp_path / "single")
+    single.add(FLIGHT)
+    expected = len(single.mapper.finish().mesh.faces)
+    single.log.close()
+
+    state = None
+    for start in range(0, LEG, 4):
+        station.add(FLIGHT[start : start + 4])
+        if start != 4:
+            state = saved(station.folder, station.mapper.state())
+        station = station.killed()
+        station.mapper.restore(state)
+    assert station.log.count == LEG
+    assert len(station.mapper.finish().mesh.faces) == pytest.approx(expected, rel=0.03)
+
+
+@pytest.mark.parametrize("with_checkpoint", [True, False])
+def test_a_restart_alone_does_not_make_phi_jump(station: Station, with_checkpoint: bool) -> None:
+    station.add(FLIGHT[:CUT])
+    assert station.mapper.update(scored=False).change.any()
+    state = station.mapper.state()
+    station.add(FLIGHT[CUT:])
+    new = station.killed()
+    new.mapper.restore(state if with_checkpoint else None)
+    assert not new.mapper.update(scored=False).change.any()
+
+
+def test_a_repeated_keyframe_stays_refused_after_a_restart(station: Station) -> None:
+    station.add(FLIGHT[:CUT])
+    new = station.killed()
+    new.mapper.restore(saved(station.folder, station.mapper.state()))
+    mesh, refused = new.mesh(), new.mapper.refused
+    moved = FLIGHT[2].model_copy(update={"position": (0.5, 0.3, HEIGHT_M)})  # far enough to be wanted, but old
+    new.add([moved])
+    assert new.mapper.refused == refused + 1
+    assert new.mesh() == mesh
+
+
+def test_images_that_cannot_be_read_are_counted_across_a_restart(station: Station) -> None:
+    broken = FLIGHT[1].model_copy(update={"jpeg": b"not an image"})
+    station.add([FLIGHT[0], broken, FLIGHT[2].model_copy(update={"width": 80})])
+    assert station.mapper.refused == 2
+    state = saved(station.folder, station.mapper.state())
+    station.add([broken])
+    new = station.killed()
+    new.mapper.restore(state)
+    assert new.mapper.refused == 3
+
+
+def test_damage_in_the_log_costs_its_keyframe_and_not_the_map(station: Station) -> None:
+    station.add(FLIGHT[:CUT])
+    state = saved(station.folder, station.mapper.state())
+    mesh = station.mesh()
+    station.add(FLIGHT[CUT:])
+    path = station.folder / "keyframes"
+    content = bytearray(path.read_bytes())
+    for place in (state.end // 2, (state.end + len(content)) // 2):
+        content[place] ^= 0xFF
+    path.write_bytes(content)
+    new = station.killed()
+    assert new.mapper.restore(state) == LEG - CUT - 1
+    assert new.faces() > len(np.frombuffer(mesh[1], np.int32)) / 3
+
+
+def test_a_log_that_is_gone_leaves_the_map_of_the_checkpoint(station: Station) -> None:
+    station.add(FLIGHT[:CUT])
+    state = saved(station.folder, station.mapper.state())
+    mesh = station.mesh()
+    (station.folder / "keyframes").unlink()
+    new = station.killed()
+    assert new.mapper.restore(state) == 0
+    assert new.mesh() == mesh
+
+
+def test_a_state_that_speaks_of_keyframes_that_are_not_safe_is_an_error(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail() -> None:
+        raise StorageError("keyframes: Input/output error")
+
+    station.add(FLIGHT[:2])
+    monkeypatch.setattr(station.log, "sync", fail)
+    with pytest.raises(StorageError):
+        station.mapper.state()
+
+
+def test_a_mapper_without_a_map_restarts_as_well(tmp_path: Path) -> None:
+    bare = MISSION.model_copy(update={"reconstruction": Reconstruction(backend="none")})
+    old = Station(tmp_path, bare)
+    old.add(FLIGHT[:3])
+    state = old.mapper.state()
+    assert state.first == state.end == old.log.end
+    old.add(FLIGHT[3:5])
+    new = old.killed()
+    assert new.mapper.restore(state) == 2
+    assert new.faces() == 0
+    old.log.close()
+    new.log.close()
