@@ -1,7 +1,7 @@
 # A newcomer runs `make demo` or `make test`, and nothing before it: both install what they need into .venv, once.
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check bench format clean install
+.PHONY: help demo test check bench faults format clean install
 
 BIN := .venv/bin
 INSTALLED := .venv/.installed
@@ -27,6 +27,10 @@ check: $(INSTALLED) ## formatting, lint, types, layers, dependencies: what CI ch
 
 bench: $(INSTALLED) ## the benchmarks, one after another
 	@$(ONE_THREAD) $(BIN)/python -m pytest tests/benchmarks
+
+# Faults on real processes, one flight after another, and on a simulated network: about an hour.
+faults: $(INSTALLED) ## what the system survives: every fault, random schedules; writes docs/reliability.md
+	@$(ONE_THREAD) PYTHONPATH=.:tests $(BIN)/python -m faults.reliability
 
 format: $(INSTALLED) ## rewrite the code in the common format, and the mission schema from the model
 	@$(BIN)/ruff format .
