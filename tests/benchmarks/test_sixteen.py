@@ -180,7 +180,7 @@ def digest(heard: Heard, began: float, ended: float) -> Flight:
 
 @pytest.mark.timeout(FLIGHT_S + 2 * START_LIMIT_S)
 def test_sixteen_drones_in_real_time(record: Record, tmp_path: Path) -> None:
-    """The issue's bar: 20 Hz for two minutes on two cores, no state lost."""
+    """The bar: 20 Hz for two minutes on two cores, no state lost."""
     flight = fly(FLIGHT_S, tmp_path)
     fresh_s = topics.STATE.max_age_s
     for quantile in (50, 99):

@@ -10,8 +10,7 @@ from typing import Any, TypeAlias
 
 from faults.processes import END_S, Flight
 from faults.witness import true_positions
-from ground_station.ground_station import JOURNAL_FILE
-from ground_station.journal import Journal
+from ground_station.journal import JOURNAL_FILE, Journal
 from ground_station.results import SUMMARY_FILE
 from ground_station.separation import nearest_distances
 

@@ -27,7 +27,7 @@ from faults.judgement import Figures, judge
 from faults.processes import START_S, STOP_BELOW, Flight, HarnessError, Transport, fly, small_mission
 from faults.proxy import Fault as Slow
 from ground_station.checkpoint import CHECKPOINT_FILE
-from ground_station.ground_station import JOURNAL_FILE
+from ground_station.journal import JOURNAL_FILE
 from protocol.session import open_session
 from protocol.topics import TOPICS
 

@@ -18,9 +18,9 @@ from protocol.mission import (
     Target,
 )
 
-FAULTY_S = 45.0
+FAULTY_S = 36.0
 """All faults have ended by then ..."""
-FLIGHT_S = 75.0
+FLIGHT_S = 62.0
 """... and at this time all must be well."""
 TELLING_S = 5.0
 """So much longer the mission lasts, in which all is compared."""
