@@ -15,6 +15,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager, suppress
@@ -29,6 +30,8 @@ GRACE_S = 5.0
 """Between SIGTERM and SIGKILL: time to brake, to close a journal and a session."""
 SETTLE_S = 20.0
 """What the others get to end by themselves once the ground station is done."""
+KILL_S, KILL_POLL_S = 2.0, 0.01
+"""How long killed processes may take to be gone, and how often it is looked for."""
 LOG_LINES = 15
 """Last lines of a failed process's log that are shown ..."""
 LOG_BYTES = 16 * 1024
@@ -192,9 +195,17 @@ async def process_group(private: Path, grace_s: float) -> AsyncIterator[int]:
     finally:
         await asyncio.to_thread(leader.communicate)  # closes the pipe, the reaper's sign
         if leader.returncode != 0:  # it had to kill the group, or was killed before it could
-            with suppress(ProcessLookupError):
-                os.killpg(leader.pid, signal.SIGKILL)
+            await _end_group(leader.pid)
             shutil.rmtree(private, ignore_errors=True)
+
+
+async def _end_group(group: int) -> None:
+    """SIGKILL, and wait until it has worked: on a busy machine it takes its time."""
+    deadline = time.monotonic() + KILL_S
+    with suppress(ProcessLookupError):
+        while time.monotonic() < deadline:
+            os.killpg(group, signal.SIGKILL)
+            await asyncio.sleep(KILL_POLL_S)
 
 
 @contextmanager

@@ -117,9 +117,9 @@ class Replication:
         """Who is live at it; in lockstep also that all jumps due by it are out."""
         if self._now < 0:
             self._begin(tick.tick)
-        self._now = max(self._now, tick.tick)
         self._lives[tick.tick] = tick.live
-        self._live = tick.live
+        if tick.tick >= self._now:
+            self._now, self._live = tick.tick, tick.live
         if tick.lockstep:
             self._note_head(tick.jump_epoch, tick.next_jump, tick.tick)
 

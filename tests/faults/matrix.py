@@ -41,6 +41,9 @@ BEFORE_S = 5.0
 """Mission time that passes first, so that there is something to lose: a map, jumps, a checkpoint."""
 LATE_PATIENCE_S = 20.0
 RUBBISH_PERIOD_S = 0.01
+LOOK_S = 0.5
+LOOP_LAG_MAX_S = 0.1
+"""Of the ground station while an agent is stopped, 99th percentile: nobody may make it wait."""
 
 WORKERS = os.cpu_count() or 1
 """Flights at a time."""
@@ -91,9 +94,17 @@ async def come_late(flight: Flight) -> Figures:
 def stopped(name: str) -> Act:
     async def act(flight: Flight) -> Figures:
         flight.signal(name, signal.SIGSTOP)
-        await asyncio.sleep(FAULT_S)
+        lags_s = []
+        for _ in range(round(FAULT_S / LOOK_S)):
+            await asyncio.sleep(LOOK_S)
+            if flight.monitor.status is not None:
+                lags_s.append(flight.monitor.status.loop_lag_s)
         flight.signal(name, signal.SIGCONT)
-        return {}
+        if name == "ground":
+            return {}
+        if max(lags_s) >= LOOP_LAG_MAX_S:
+            raise HarnessError(f"the ground station's event loop was {max(lags_s):.3f} s late (99 %)")
+        return {"ground_loop_lag_p99_ms": round(max(lags_s) * 1e3, 1)}
 
     return act
 
