@@ -12,7 +12,7 @@ TESTS = Path(__file__).parent
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Tests that start processes run one after another, on one worker: they would starve each other of cores."""
     for item in items:
-        if item.path.relative_to(TESTS).parts[0] in ("integration", "scenario", "benchmarks"):
+        if item.path.relative_to(TESTS).parts[0] in ("integration", "benchmarks") or "processes" in item.keywords:
             item.add_marker(pytest.mark.xdist_group("processes"))
 
 

@@ -264,9 +264,10 @@ def test_a_command_that_does_not_exist_is_an_error_and_ends_what_was_started(run
 
 
 LAUNCHER = """
-    import asyncio, json, sys
+    import asyncio, json, signal, sys
     from pathlib import Path
     from deploy.local import Role, supervise
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whoever runs the tests may ignore it
     run, roles = Path(sys.argv[1]), [Role(*role) for role in json.loads(sys.argv[2])]
     def say(text): print(text, flush=True)
     sys.exit(asyncio.run(supervise(roles, logs=run / "logs", private=run / "private", say=say, grace_s=0.5)))

@@ -15,7 +15,7 @@ from deploy.progress import follow
 from deploy.run_folder import socket_endpoint, socket_folder_parent
 from protocol.bus import connect
 from protocol.guard import ROOT
-from protocol.messages import Status
+from protocol.messages import ReplicaState, Status
 from protocol.mission_file import load_mission
 from protocol.topics import STATUS
 
@@ -62,6 +62,10 @@ async def test_what_the_ground_station_publishes_is_shown(endpoint: str) -> None
         f_score_objects=0.1,
         keyframes=3,
         dropped=0,
+        replica=ReplicaState(tick=0, epoch=0, next_jump=0, missing=0, repaired=0, lost=0),
+        refused=0,
+        unwritten=0,
+        loop_lag_s=0.0,
         keyframes_per_s=2.0,
         jumps=0,
         min_separation_m=1.5,

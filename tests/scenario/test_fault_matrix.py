@@ -12,6 +12,7 @@ STOP_BELOW = 0.25
 """Reached in a third of the time that `make faults` takes for a cell."""
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize(
     "name",
     [
