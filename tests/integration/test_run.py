@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
-from PIL import Image
+
+from faults.processes import write_scene
 
 COVRECON = Path(sys.executable).with_name("covrecon")
 Write = Callable[..., Path]
@@ -55,21 +55,7 @@ start = [0.8, 0.0, 1.4, 3.0, 1.3]
 
 @pytest.fixture(scope="session")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A table on a floor, every face covered with random patches: as small as a world can be and still be mapped."""
-    patches = np.random.default_rng(7).integers(0, 255, (20, 20, 3), dtype=np.uint8)
-    image = Image.fromarray(patches).resize((512, 512), Image.Resampling.BICUBIC)
-    parts = []
-    for extents, centre in (((3.0, 3.0, 0.1), (0, 0, -0.05)), ((0.8, 0.6, 0.35), (0.1, 0.0, 0.175))):
-        box = trimesh.creation.box(extents)
-        box.apply_translation(centre)
-        box.unmerge_vertices()
-        along = np.abs(box.face_normals).argmax(axis=1).repeat(3)
-        flat = np.array([np.delete(vertex, axis) for vertex, axis in zip(box.vertices, along, strict=True)])
-        box.visual = trimesh.visual.TextureVisuals(uv=flat / 1.6, image=image)
-        parts.append(box)
-    path = tmp_path_factory.mktemp("scene") / "table.obj"
-    trimesh.Scene(parts).to_mesh().export(path)
-    return path
+    return write_scene(tmp_path_factory.mktemp("scene"))
 
 
 @pytest.fixture
