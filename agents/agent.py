@@ -243,7 +243,7 @@ class Agent:
             pitch_margin_rad2=rows.margin("pitch", UNLIMITED),
             active=decision.active,
             fallbacks=self._fallbacks,
-            refused=sum(self._bus.statistics.refused.values()) + self._replication.refused,
+            refused=self._bus.statistics.unused + self._replication.refused,
         )
 
 

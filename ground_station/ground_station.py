@@ -213,7 +213,7 @@ class GroundStation:
             phase=self._phase,
             backlog=self._feedback.backlog,
             dropped=self._feedback.unused,
-            refused=self._replication.refused + sum(self._bus.statistics.refused.values()),
+            refused=self._bus.statistics.unused + self._replication.refused,
             unwritten=self._jumps.unwritten + self._recovery.unwritten + self._run.refused_writes,
             loop_lag_s=self._lag.p99_s,
             alive=self._bus.alive,

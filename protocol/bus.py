@@ -57,6 +57,11 @@ class BusStatistics:
     failed: Counter[str] = field(default_factory=Counter)
     """Messages and questions that made their handler raise, by topic."""
 
+    @property
+    def unused(self) -> int:
+        """All of them."""
+        return self.refused.total() + self.dropped.total() + self.failed.total()
+
 
 class Bus:
     """One process's session. Make it with `connect`; it belongs to the event loop that opened it.

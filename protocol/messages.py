@@ -87,7 +87,7 @@ class Control(Message):
     fallbacks: Count
     """Ticks so far that braked because the solver did not say "solved"."""
     refused: Count
-    """Messages refused so far by this process."""
+    """Messages that this process refused, had no room for or failed on so far."""
 
 
 class ReplicaState(Message):
@@ -248,7 +248,7 @@ class Status(Message):
     replica: ReplicaState
     """The ground station's own."""
     refused: Count
-    """Messages that this process refused so far."""
+    """Messages that this process refused, had no room for or failed on so far."""
     unwritten: Count
     """Records that the disk refused so far, a jump among them: it is kept in memory and tried again."""
     loop_lag_s: Finite
