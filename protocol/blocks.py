@@ -31,8 +31,6 @@ class BlockLayout:
         self._starts = np.arange(self.count) * BLOCK_POSITIONS
         cells = np.diff(np.append(self._starts, self.positions)) * self.directions
         self._scale = 1.0 / np.column_stack([cells, *[np.sqrt(cells)] * (SKETCHES - 1)])
-        self._row_signs = _signs(self.positions, salt=0)
-        self._column_signs = _signs(self.directions, salt=1).astype(np.float32)
 
     def rows(self, block: int) -> slice:
         """Its positions."""
@@ -47,9 +45,13 @@ class BlockLayout:
     def blocks_a_page(self) -> int:
         return max(1, PAGE_BYTES // (BLOCK_POSITIONS * self.directions * 4))
 
-    def sketch(self, phi: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(blocks, SKETCHES) of phi (positions, directions); equal bytes give equal sketches."""
-        by_position = (phi @ self._column_signs).astype(np.float64) * self._row_signs
+    def sketch(self, phi: NDArray[np.float32], tick: int) -> NDArray[np.float32]:
+        """(blocks, SKETCHES) of phi (positions, directions); at one tick equal bytes give equal sketches.
+
+        Every tick has its own signs: a difference that one projection hides, another soon shows.
+        """
+        column_signs = _signs(self.directions, salt=2 * tick + 1).astype(np.float32)
+        by_position = (phi @ column_signs).astype(np.float64) * _signs(self.positions, salt=2 * tick)
         return (np.add.reduceat(by_position, self._starts, axis=0) * self._scale).astype(np.float32)
 
     def differing(self, one: NDArray[np.float32], other: NDArray[np.float32], tolerance: float) -> list[int]:
@@ -60,7 +62,7 @@ class BlockLayout:
 
 def _signs(count: int, salt: int) -> Floats:
     """(count, SKETCHES): ones for the mean, then +-1 from the bits of a hash (splitmix64; Steele et al., 2014)."""
-    state = (np.arange(count, dtype=np.uint64) * np.uint64(2) + np.uint64(salt + 1)) * np.uint64(0x9E3779B97F4A7C15)
+    state = (np.arange(count, dtype=np.uint64) + np.uint64(salt << 32)) * np.uint64(0x9E3779B97F4A7C15)
     state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     state ^= state >> np.uint64(31)

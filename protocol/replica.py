@@ -94,9 +94,11 @@ class Replica:
         """Whether this replica has got as far as the page: in ticks, and in jumps, or one would be applied twice."""
         return page.tick <= self.tick and page.next_sequence <= self.jumps.taken
 
-    def reaches_back(self, tick: int) -> bool:
-        """Whether the steps since ``tick`` are remembered."""
-        return tick == self.tick or bool(self._steps and self._steps[0].tick <= tick)
+    def reaches_back(self, page: PhiPage) -> bool:
+        """Whether the steps since the page's tick are remembered, and all jumps that it lacks and this replica has."""
+        steps = page.tick == self.tick or bool(self._steps and self._steps[0].tick <= page.tick)
+        jumps = sum(jump.epoch == page.epoch for step in self._steps for jump in step.jumps)
+        return steps and self.jumps.taken - jumps <= page.next_sequence
 
     def place(self, page: PhiPage) -> None:
         """Put in a page that fits, is placeable and is reached back to, carried forward to this replica's tick."""

@@ -239,7 +239,7 @@ class Replication:
         self._lives = {known: live for known, live in self._lives.items() if known > tick}
         self._place_pages()
         if self.replica.tick % self._digest_ticks == 0 and self.whole:
-            self._sketches[self.replica.tick] = self.replica.layout.sketch(self.replica.field.phi)
+            self._sketches[self.replica.tick] = self.replica.layout.sketch(self.replica.field.phi, self.replica.tick)
             self._compare(self.replica.tick)
         for reached in [entry for entry in self._reached if entry[0] <= self.replica.tick]:
             self._reached.remove(reached)
@@ -305,7 +305,7 @@ class Replication:
         for page in self._pages:
             if not self.replica.is_placeable(page):
                 waiting.append(page)
-            elif self.replica.reaches_back(page.tick):
+            elif self.replica.reaches_back(page):
                 self.replica.place(page)
                 blocks = self._wanted.intersection(page.blocks.tolist())
                 self._wanted -= blocks

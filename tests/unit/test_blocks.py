@@ -27,8 +27,8 @@ def test_blocks_cover_every_position_once() -> None:
 
 
 def test_equal_fields_have_equal_sketches() -> None:
-    assert LAYOUT.sketch(field()).shape == (LAYOUT.count, SKETCHES)
-    assert LAYOUT.differing(LAYOUT.sketch(field()), LAYOUT.sketch(field()), 0.0) == []
+    assert LAYOUT.sketch(field(), 20).shape == (LAYOUT.count, SKETCHES)
+    assert LAYOUT.differing(LAYOUT.sketch(field(), 20), LAYOUT.sketch(field(), 20), 0.0) == []
 
 
 @settings(max_examples=200, deadline=None, derandomize=True)
@@ -37,7 +37,9 @@ def test_a_single_cell_that_differs_is_found_wherever_it_is(position: int, direc
     phi = field()
     phi[position, direction] += np.float32(0.01)
 
-    assert LAYOUT.differing(LAYOUT.sketch(phi), LAYOUT.sketch(field()), TOLERANCE) == [position // BLOCK_POSITIONS]
+    assert LAYOUT.differing(LAYOUT.sketch(phi, 20), LAYOUT.sketch(field(), 20), TOLERANCE) == [
+        position // BLOCK_POSITIONS
+    ]
 
 
 @settings(max_examples=200, deadline=None, derandomize=True)
@@ -48,7 +50,7 @@ def test_differences_that_cancel_in_the_mean_are_found(seed: int) -> None:
     change = np.random.default_rng(seed).normal(0, 1e-3, (BLOCK_POSITIONS, DIRECTIONS))
     other[:BLOCK_POSITIONS] += (change - change.mean()).astype(np.float32)
 
-    assert LAYOUT.differing(LAYOUT.sketch(other), LAYOUT.sketch(field()), TOLERANCE) == [0]
+    assert LAYOUT.differing(LAYOUT.sketch(other, 20), LAYOUT.sketch(field(), 20), TOLERANCE) == [0]
 
 
 def test_the_projections_estimate_the_root_mean_square_difference() -> None:
@@ -56,17 +58,27 @@ def test_the_projections_estimate_the_root_mean_square_difference() -> None:
     for seed in range(200):
         other = field()
         other += np.random.default_rng(seed).normal(0, 1e-2, other.shape).astype(np.float32)
-        apart = LAYOUT.sketch(other).astype(float) - LAYOUT.sketch(field())
+        apart = LAYOUT.sketch(other, 20).astype(float) - LAYOUT.sketch(field(), 20)
         squares.append((apart[:, 1:] ** 2).mean())
 
     assert np.sqrt(np.mean(squares)) == pytest.approx(1e-2, rel=0.1)
+
+
+def test_a_difference_just_above_the_tolerance_is_found_within_seconds() -> None:
+    other = field()
+    other += np.random.default_rng(5).choice([-1.5e-5, 1.5e-5], other.shape).astype(np.float32)
+    found: set[int] = set()
+    for tick in range(20, 220, 20):
+        found |= set(LAYOUT.differing(LAYOUT.sketch(other, tick), LAYOUT.sketch(field(), tick), TOLERANCE))
+
+    assert found == set(range(LAYOUT.count))
 
 
 def test_rounding_alone_is_below_the_tolerance() -> None:
     """What another processor's float32 arithmetic adds up to: an error of 1e-6 in every cell."""
     other = field() * (1 + np.random.default_rng(3).normal(0, 1e-6, (POSITIONS, DIRECTIONS))).astype(np.float32)
 
-    assert LAYOUT.differing(LAYOUT.sketch(other), LAYOUT.sketch(field()), TOLERANCE) == []
+    assert LAYOUT.differing(LAYOUT.sketch(other, 20), LAYOUT.sketch(field(), 20), TOLERANCE) == []
 
 
 @pytest.mark.parametrize("directions", [42, 208, 5000])

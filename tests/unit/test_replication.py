@@ -342,6 +342,19 @@ def test_without_a_ground_station_one_that_slept_keeps_what_it_has() -> None:
     assert slept.lost > 200, "whoever has to choose a phi is told"
 
 
+def test_a_page_that_lacks_a_jump_which_the_replica_no_longer_remembers_is_not_placed() -> None:
+    team = Team()
+    team.fly(40)
+    slept = team.drones[3]
+    before = team.ground.page([0])
+    page = before.model_copy(update={"tick": slept.replica.tick, "next_sequence": slept.replica.jumps.taken - 1})
+    slept.replica._steps.clear()
+
+    slept.hear_page(page)
+
+    assert slept.replica.field.sha256 == team.drones[2].replica.field.sha256
+
+
 def test_an_old_head_that_comes_late_changes_no_epoch() -> None:
     team = Team()
     team.fly(20)
