@@ -13,6 +13,7 @@ STOP_BELOW = 0.25
 
 
 @pytest.mark.processes
+@pytest.mark.timeout(300)  # the flight has its own bounds, which add up to more than other tests may take
 @pytest.mark.parametrize(
     "name",
     [
