@@ -26,6 +26,9 @@ T = TypeVar("T")
 
 log = logging.getLogger(__name__)
 
+NO_LIMIT = 2**62
+"""Bytes of a page that does not travel."""
+
 
 class JumpPublisher:
     def __init__(self, bus: Bus, journal: Journal, replication: Replication) -> None:
@@ -120,7 +123,3 @@ class JumpPublisher:
         """The journal with it; an append that has begun is completed."""
         self._disk.shutdown(wait=True, cancel_futures=True)
         self._journal.close()
-
-
-NO_LIMIT = 2**62
-"""Bytes of a page that does not travel."""

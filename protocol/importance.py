@@ -83,14 +83,15 @@ class ImportanceField:
         return self.advance(poses, 0.0, own)
 
     def overwrite(self, rows: NDArray[np.int64], values: NDArray[np.float32]) -> None:
-        """Set phi at the positions ``rows`` (n,) to ``values`` (n, directions), and count J anew."""
+        """Set phi at the positions ``rows`` (n,), each given once, to ``values`` (n, directions)."""
+        self._total += float(values.sum(dtype=np.float64) - self.phi[rows].sum(dtype=np.float64))
         self.phi[rows] = values
-        self._total = float(self.phi.sum(dtype=np.float64))
 
-    def copy(self) -> ImportanceField:
-        """One that changes by itself; the lattice is shared."""
+    def blank(self) -> ImportanceField:
+        """One that is 0 everywhere and changes by itself; the lattice is shared. Costs what is written to it."""
         twin = copy.copy(self)
-        twin.phi = self.phi.copy()
+        twin.phi = np.zeros_like(self.phi)
+        twin._total = 0.0
         return twin
 
     def jump(self, increments: NDArray[np.float32]) -> None:

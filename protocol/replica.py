@@ -103,7 +103,7 @@ class Replica:
     def place(self, page: PhiPage) -> None:
         """Put in a page that fits, is placeable and is reached back to, carried forward to this replica's tick."""
         rows = self.layout.rows_of(page.blocks)
-        carried = self.field.copy()
+        carried = self.field.blank()  # positions do not depend on each other: those of the page are enough
         carried.overwrite(rows, page.phi)
         for step in self._steps:
             for jump in step.jumps:

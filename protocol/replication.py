@@ -39,10 +39,6 @@ log = logging.getLogger(__name__)
 
 AHEAD_TICKS = 40
 """States of ticks further ahead of this process's own clock are refused: their sender's clock is wrong."""
-COMPARED_TICKS = 200
-"""Digests and own sketches older than this are forgotten."""
-BLOCKS_A_QUERY = 64
-"""Blocks named in one query; the reply holds what fits its page."""
 TOO_FAR_BEHIND_TICKS = HISTORY_TICKS // 2
 """A replica that slept longer than this fetches phi instead of integrating what it can no longer know."""
 
@@ -277,7 +273,7 @@ class Replication:
                 self._wanted_from = max(self._wanted_from, tick)
             del self._digests[tick]
         for kept in (self._digests, self._sketches):
-            for old in [known for known in kept if known < tick - COMPARED_TICKS]:
+            for old in [known for known in kept if known < tick - HISTORY_TICKS]:
                 del kept[old]
 
     def _want_all(self, tick: int) -> None:
@@ -298,7 +294,7 @@ class Replication:
         wanted = self._wanted.difference(*[page.blocks.tolist() for page in self._pages])
         if not wanted:
             return None
-        return BlocksRequest(tuple(sorted(wanted)[:BLOCKS_A_QUERY]), self._wanted_from)
+        return BlocksRequest(tuple(sorted(wanted)[: self.replica.layout.blocks_a_page()]), self._wanted_from)
 
     def _place_pages(self) -> None:
         waiting = []

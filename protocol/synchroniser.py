@@ -37,8 +37,6 @@ class Synchroniser:
         """``own``: the drone of this process, which does not ask itself; 0 for the ground station. ``rank``: of the
         drones that may be asked, the one with the lowest is first."""
         self._bus, self._replication, self._own, self._rank = bus, replication, own, rank
-        self.unanswered = 0
-        """Queries that nobody answered in time."""
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
@@ -62,13 +60,13 @@ class Synchroniser:
             request = wants()
             if request is None:
                 continue
-            if await self.fetch(request):
+            if await self._fetch(request):
                 pause = RETRY_S
             else:
                 await asyncio.sleep(pause)
                 pause = min(2 * pause, RETRY_MAX_S)
 
-    async def fetch(self, request: Request) -> bool:
+    async def _fetch(self, request: Request) -> bool:
         """Ask for ``request``; whether an answer came that could be used."""
         try:
             if isinstance(request, JournalRequest):
@@ -79,7 +77,6 @@ class Synchroniser:
                 page = await self._ask_blocks(f"blocks={blocks};from={request.tick}")
                 self._replication.hear_page(page)
         except (NoReply, MessageError) as error:
-            self.unanswered += 1
             log.info("phi: %s", error)
             return False
         self._bus.recheck()
