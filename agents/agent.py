@@ -172,10 +172,8 @@ class Agent:
         """Bring phi forward; the sampling terms at the own pose."""
         ready = self._replication.is_ready
         if self._lockstep:
-            await self._bus.until(
-                lambda: bool(self._finished) or ready(tick.tick, self._bus.alive), LOCKSTEP_PATIENCE_S
-            )
-        steps = self._replication.integrate(tick.tick, self._bus.alive, self._wait_ticks)
+            await self._bus.until(lambda: bool(self._finished) or ready(tick.tick, self._bus.gone), LOCKSTEP_PATIENCE_S)
+        steps = self._replication.integrate(tick.tick, self._bus.gone, self._wait_ticks)
         if steps and steps[-1].terms is not None:
             return steps[-1].terms
         return self._replication.terms()

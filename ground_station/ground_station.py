@@ -123,7 +123,7 @@ class GroundStation:
             log.warning("tick %d: going on without all states and keyframes: this run cannot be repeated", tick.tick)
         self._feedback.hand_over(tick.tick)
         await self._feedback.settle(tick.tick)
-        steps = self._replication.integrate(tick.tick, self._bus.alive, self._wait_ticks)
+        steps = self._replication.integrate(tick.tick, self._bus.gone, self._wait_ticks)
         if self._replication.known:
             self._board.activity = ""
             for step in steps:
@@ -138,7 +138,7 @@ class GroundStation:
         self._board.note_lives(self._bus.alive)
 
     def _is_complete(self, tick: Tick) -> bool:
-        return self._feedback.received >= tick.keyframes and self._replication.is_ready(tick.tick, self._bus.alive)
+        return self._feedback.received >= tick.keyframes and self._replication.is_ready(tick.tick, self._bus.gone)
 
     def _take_in(self, step: Integrated) -> None:
         """Record a tick that is integrated, and do what is due at it."""

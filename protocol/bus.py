@@ -86,6 +86,9 @@ class Bus:
         self._lives: deque[tuple[str, bool]] = deque()
         self.alive: set[str] = set()
         """Roles with a liveliness token: "ground", "sim", "drone/1" ...; nobody while the router is away."""
+        self.gone: set[str] = set()
+        """Roles that had one and lost it. Whoever is in neither set may live already: a token may come after what its
+        process said."""
         self.statistics = BusStatistics()
 
     # --- sending -------------------------------------------------------------------------------------------------
@@ -201,6 +204,7 @@ class Bus:
         while self._lives:
             role, alive = self._lives.popleft()
             (self.alive.add if alive else self.alive.discard)(role)
+            (self.gone.discard if alive else self.gone.add)(role)
         for subscription in list(self._subscriptions.values()):
             for _ in range(subscription.topic.queue):
                 payload = subscription.take()

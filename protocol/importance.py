@@ -91,7 +91,7 @@ class ImportanceField:
         """One that is 0 everywhere and changes by itself; the lattice is shared. Costs what is written to it."""
         twin = copy.copy(self)
         twin.phi = np.zeros_like(self.phi)
-        twin._total = 0.0
+        twin._total = 0.0  # noqa: SLF001  # of this class
         return twin
 
     def jump(self, increments: NDArray[np.float32]) -> None:

@@ -197,28 +197,28 @@ class Replication:
 
     # --- integrating ---------------------------------------------------------------------------------------------
 
-    def is_ready(self, tick: int, alive: Collection[str]) -> bool:
-        """Whether all that ``tick`` needs is in. ``alive``: roles; nobody else is waited for."""
+    def is_ready(self, tick: int, gone: Collection[str]) -> bool:
+        """Whether all that ``tick`` needs is in. ``gone``: roles that are not waited for."""
         if tick < self.replica.tick:
             return True
-        waited_for = [drone for drone in self._lives.get(tick, self._live) if f"drone/{drone}" in alive]
-        return self.log.has_all(tick, waited_for) and (self._has_jumps(tick) or "ground" not in alive)
+        waited_for = [drone for drone in self._lives.get(tick, self._live) if f"drone/{drone}" not in gone]
+        return self.log.has_all(tick, waited_for) and (self._has_jumps(tick) or "ground" in gone)
 
     def _has_jumps(self, tick: int) -> bool:
         jumps = self.replica.jumps
         promised = jumps.epoch == self._head_epoch and self._done >= tick
         return self._authority or (promised and jumps.next_sequence >= self._head_sequence)
 
-    def integrate(self, now: int, alive: Collection[str], wait_ticks: int) -> list[Integrated]:
+    def integrate(self, now: int, gone: Collection[str], wait_ticks: int) -> list[Integrated]:
         """Advance phi as far as can be, at most up to and including tick ``now``."""
         behind = now - self.replica.tick > TOO_FAR_BEHIND_TICKS
-        if behind and not self._authority and "ground" in alive:  # without it, what is left is all there is
+        if behind and not self._authority and "ground" not in gone:  # without it, what is left is all there is
             log.warning("phi is %d ticks behind and is fetched anew", now - self.replica.tick)
             self.replica.tick = now + 1
             self._want_all(now + 1)
         steps = []
         while self.replica.tick <= now:
-            ready = self.is_ready(self.replica.tick, alive)
+            ready = self.is_ready(self.replica.tick, gone)
             if not ready and now - self.replica.tick < wait_ticks:
                 break
             steps.append(self._advance(now))

@@ -128,7 +128,8 @@ def test_a_mission_maps_its_scene_and_a_second_one_is_equal_to_the_last_bit(
         folder = tmp_path / out / "latest"
         for name in ("report.html", "mesh.ply", "mesh.glb", "metrics.csv", "mission.toml", "truth.ply"):
             assert (folder / name).stat().st_size > 0
-        outcomes.append((json.loads((folder / "summary.json").read_text()), np.load(folder / "trajectories.npz")))
+        with np.load(folder / "trajectories.npz") as recorded:
+            outcomes.append((json.loads((folder / "summary.json").read_text()), dict(recorded)))
     (summary, flown), (again, reflown) = outcomes
     assert summary["J"] < 1
     assert summary["jumps"] > 0
