@@ -12,7 +12,7 @@ from protocol.bus import Bus
 from protocol.messages import Tick
 
 SIMULATOR_PATIENCE_S = 20.0
-"""A simulator that has been neither heard nor seen for so long is given up; a router's restart takes a few seconds."""
+"""A simulator that was neither heard nor seen in so long a wait is given up; a router's restart takes a few seconds."""
 
 
 class Clock(Protocol):
@@ -47,11 +47,11 @@ class SimulatorClock:
         self._ticks: deque[Tick] = deque()
         self._newest = -1
         self._time_s = 0.0
-        self._heard_s: float | None = None
+        self._waited_s: float | None = None
         bus.on(topics.TICK, self._hear)
 
     def _hear(self, tick: Tick) -> None:
-        self._heard_s = self._now_s()
+        self._waited_s = 0.0
         if tick.tick <= self._newest:  # said again for those who just came, or late
             return
         self._newest = tick.tick
@@ -61,6 +61,8 @@ class SimulatorClock:
     async def next_tick(self, timeout_s: float) -> Tick | None:
         if await self._bus.until(lambda: bool(self._ticks), timeout_s):
             return self._ticks.popleft()
+        if self._waited_s is not None:  # time spent waiting: while this process is stopped, it hears nobody
+            self._waited_s += timeout_s
         return None
 
     @property
@@ -69,9 +71,9 @@ class SimulatorClock:
 
     @property
     def is_gone(self) -> bool:
-        if self._heard_s is None or "sim" in self._bus.alive:
+        if self._waited_s is None or "sim" in self._bus.alive:
             return False
-        return self._now_s() - self._heard_s > SIMULATOR_PATIENCE_S
+        return self._waited_s > SIMULATOR_PATIENCE_S
 
     def now_s(self) -> float:
         return self._time_s if self._lockstep else self._now_s()

@@ -175,16 +175,30 @@ async def test_a_tick_that_is_said_again_or_late_counts_once(bus: NotingBus) -> 
     assert clock.backlog == 0
 
 
-def test_a_simulator_is_given_up_when_it_is_neither_heard_nor_seen_for_long(bus: NotingBus) -> None:
-    now_s = 100.0
-    clock = SimulatorClock(cast("Bus", bus), lockstep=False, now_s=lambda: now_s)
+async def test_a_simulator_is_given_up_when_it_is_neither_heard_nor_seen_in_a_long_wait(bus: NotingBus) -> None:
+    clock = SimulatorClock(cast("Bus", bus), lockstep=False)
+    await clock.next_tick(SIMULATOR_PATIENCE_S)
     assert not clock.is_gone, "not before it was there"
     bus.beat(0)
-    now_s += SIMULATOR_PATIENCE_S
+    await clock.next_tick(0.0)
+    await clock.next_tick(SIMULATOR_PATIENCE_S)
     assert not clock.is_gone
-    now_s += 0.1
+    await clock.next_tick(0.1)
     assert clock.is_gone
     bus.alive.add("sim")
+    assert not clock.is_gone
+    bus.alive.clear()
+    bus.beat(1)
+    assert not clock.is_gone
+
+
+async def test_a_process_that_slept_does_not_take_its_sleep_for_the_simulators_silence(bus: NotingBus) -> None:
+    now_s = 100.0
+    clock = SimulatorClock(cast("Bus", bus), lockstep=False, now_s=lambda: now_s)
+    bus.beat(0)
+    await clock.next_tick(0.0)
+    now_s += 10 * SIMULATOR_PATIENCE_S
+    assert await clock.next_tick(0.2) is None
     assert not clock.is_gone
 
 
