@@ -22,7 +22,7 @@ from ground_station.results import Metrics, RunFolder
 from ground_station.status import StatusBoard
 from protocol import topics
 from protocol.bus import Bus, connect
-from protocol.clock import SimulatorClock
+from protocol.clock import clock_of
 from protocol.field import VirtualField
 from protocol.importance import compile_kernels
 from protocol.loop_lag import LoopLag
@@ -57,7 +57,7 @@ class GroundStation:
         self._jumps = JumpPublisher(bus, journal, self._replication)
         self._feedback = MapFeedback(mission, mapper, self._jumps, lockstep=lockstep)
         self._recovery = Recovery(mission, bus, run, self._replication, self._jumps, self._feedback, mapper)
-        self._clock = SimulatorClock(bus, lockstep=lockstep, now_s=asyncio.get_running_loop().time)
+        self._clock = clock_of(mission, bus, lockstep=lockstep, now_s=asyncio.get_running_loop().time)
         self._lag = LoopLag()
         self._phase: Phase = "starting"
         self._reason = ""
@@ -157,15 +157,7 @@ class GroundStation:
     # --- what goes out -------------------------------------------------------------------------------------------
 
     def _record(self, tick: int, poses: dict[int, list[float]]) -> None:
-        controls = self._board.controls(poses)
-        self._run.record_tick(
-            tick,
-            tick * self._mission.tick_s,
-            poses,
-            {drone: control.solve_s for drone, control in controls.items()},
-            {drone: control.slack for drone, control in controls.items()},
-            {drone: control.outcome for drone, control in controls.items() if control.outcome != "solved"},
-        )
+        self._run.record_tick(tick, tick * self._mission.tick_s, poses, self._board.controls(poses))
         self._board.note_poses(poses)
         if tick % max(1, round(METRICS_PERIOD_S / self._mission.tick_s)) == 0:
             self._run.record_metrics(self._metrics())

@@ -29,6 +29,7 @@ from ground_station.metrics_file import MetricsFile
 from ground_station.separation import nearest_distances
 from ground_station.trajectories import Trajectories
 from protocol.errors import MissionError, StorageError
+from protocol.messages import Control
 from protocol.mission import Mission
 
 log = logging.getLogger(__name__)
@@ -186,16 +187,14 @@ class RunFolder:
         tick: int,
         time_s: float,
         poses: Mapping[int, Sequence[float]],
-        solve_times_s: Mapping[int, float],
-        slacks: Mapping[int, float],
-        fallbacks: Mapping[int, str],
+        controls: Mapping[int, Control],
     ) -> None:
         """Keep one tick; every mapping goes by drone id and may lack drones that were not heard.
 
-        ``poses`` are x, y, z in metres, yaw, pitch in radians; ``fallbacks`` say why a drone braked, "" if it did
-        not. Costs some ten microseconds: it is called 200 times a second.
+        ``poses`` are x, y, z in metres, yaw, pitch in radians; ``controls`` the newest decisions. Costs some ten
+        microseconds: it is called 200 times a second.
         """
-        self._trajectories.add(tick, time_s, poses, solve_times_s, slacks, fallbacks)
+        self._trajectories.add(tick, time_s, poses, controls)
         for drone, distance in nearest_distances(poses).items():
             self._separations[drone] = min(self._separations[drone], distance)
             self._min_separation = min(self._min_separation, distance)

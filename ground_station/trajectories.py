@@ -15,11 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ground_station.durable import replace_file
+from protocol.messages import Control
 
 COORDINATES = 5
 """x, y, z in metres, yaw and pitch in radians."""
 UNREADABLE = (OSError, RuntimeError, KeyError, EOFError, struct.error, zlib.error, zipfile.BadZipFile)
 """What zipfile and numpy raise, beside ValueError, on damaged files; found by changing every byte of one."""
+
+_UNHEARD = (math.nan,) * 3
+"""Solve time, slack and age of the telemetry of a drone that has decided nothing."""
 
 
 class Trajectories:
@@ -36,24 +40,16 @@ class Trajectories:
         tick: int,
         time_s: float,
         poses: Mapping[int, Sequence[float]],
-        solve_times_s: Mapping[int, float],
-        slacks: Mapping[int, float],
-        fallbacks: Mapping[int, str],
+        controls: Mapping[int, Control],
     ) -> None:
         """Every mapping goes by drone id and may lack drones that were not heard."""
         pose_row = np.full((len(self._drones), COORDINATES), np.nan)
         for drone, pose in poses.items():
             pose_row[self._column[drone]] = pose
-        self._rows.append(
-            (
-                tick,
-                time_s,
-                pose_row,
-                [solve_times_s.get(drone, math.nan) for drone in self._drones],
-                [slacks.get(drone, math.nan) for drone in self._drones],
-                [fallbacks.get(drone, "") for drone in self._drones],
-            )
-        )
+        heard = [controls.get(drone) for drone in self._drones]
+        numbers = [_UNHEARD if each is None else (each.solve_s, each.slack, each.telemetry_age_s) for each in heard]
+        braked = ["" if each is None or each.outcome == "solved" else each.outcome for each in heard]
+        self._rows.append((tick, time_s, pose_row, numbers, braked))
 
     def write(self, path: Path) -> None:
         """Write all that is flown by now. Raises OSError."""
@@ -92,13 +88,15 @@ class Trajectories:
         return self._flown
 
     def _as_arrays(self, rows: Sequence[tuple[Any, ...]]) -> dict[str, NDArray[Any]]:
-        ticks, times, poses, solve_times, slacks, fallbacks = zip(*rows, strict=True) if rows else ((),) * 6
+        ticks, times, poses, numbers, fallbacks = zip(*rows, strict=True) if rows else ((),) * 5
         shape = (len(rows), len(self._drones))
+        solve_times, slacks, ages = np.moveaxis(np.array(numbers, np.float64).reshape(*shape, len(_UNHEARD)), -1, 0)
         return {
             "tick": np.array(ticks, dtype=np.int64),
             "time_s": np.array(times, dtype=np.float64),
             "poses": np.array(poses, dtype=np.float64).reshape(*shape, COORDINATES),
-            "solve_time_s": np.array(solve_times, dtype=np.float64).reshape(shape),
-            "slack": np.array(slacks, dtype=np.float64).reshape(shape),
+            "solve_time_s": solve_times,
+            "slack": slacks,
+            "telemetry_age_s": ages,
             "fallback": np.array(fallbacks, dtype=np.str_).reshape(shape),
         }

@@ -19,8 +19,10 @@ Vector5 = tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate]
 """x, y, z, camera yaw, camera pitch (depression), or their rates."""
 Outcome = Literal["solved", "infeasible", "out_of_time", "numerical", "none"]
 """What the solver said; anything but "solved" brakes. "none" before the first decision."""
-Mode = Literal["flying", "braking", "joining", "holding", "landing"]
-"""joining: waits for phi; holding and landing: without a ground station for longer than the mission allows."""
+Mode = Literal["starting", "flying", "braking", "joining", "holding", "returning", "landing", "landed", "yielded"]
+"""starting: on the ground or taking off; joining: waits for phi; braking: the solver found no way; holding, returning
+and landing: by a policy, or because the mission is over; landed: stands on the ground and will stay there; yielded: a
+pilot or the autopilot itself flies."""
 Phase = Literal["starting", "flying", "finished"]
 
 
@@ -88,6 +90,8 @@ class Control(Message):
     """Ticks so far that braked because the solver did not say "solved"."""
     refused: Count
     """Messages that this process refused, had no room for or failed on so far."""
+    telemetry_age_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    """Of what the decision was made by."""
 
 
 class ReplicaState(Message):

@@ -19,6 +19,7 @@ from ground_station.report.picture import oblique_view, view_from_above
 from ground_station.report.run_data import Mesh, load_run
 from ground_station.results import Metrics, RunFolder
 from protocol.errors import CovreconError, MissionError
+from protocol.messages import Control
 from protocol.mission import Drone, Feedback, Mission, Reconstruction
 
 SCORES = Scores(visible=Score.of(0.96, 0.8), exposed=Score.of(0.96, 0.7), objects=Score.of(0.9, 0.6))
@@ -59,9 +60,16 @@ def flown(
     for tick in range(TICKS):
         angles = {drone: 0.02 * tick + 2 * math.pi * drone / len(ids) for drone in ids}
         poses = {drone: (2 * math.cos(a), 2 * math.sin(a), 2.0, 0.1, 1.3) for drone, a in angles.items()}
-        solve_times = {drone: float(rng.lognormal(-7, 0.3)) for drone in ids}
-        fallbacks = {ids[-1]: "infeasible"} if tick in (50, 51) else {}
-        run.record_tick(tick, tick / 20, poses, solve_times, dict.fromkeys(ids, -0.25), fallbacks)
+        controls = {
+            drone: Control.model_construct(
+                solve_s=float(rng.lognormal(-7, 0.3)),
+                slack=-0.25,
+                outcome="infeasible" if drone == ids[-1] and tick in (50, 51) else "solved",
+                telemetry_age_s=0.0,
+            )
+            for drone in ids
+        }
+        run.record_tick(tick, tick / 20, poses, controls)
         if tick % 20 == 0:
             importance = math.exp(-tick / 200)
             jumps += importance < mission.feedback.threshold and mission.feedback.method != "none"
@@ -205,7 +213,7 @@ def test_too_near_and_worse_than_a_floor_are_marked(tmp_path: Path) -> None:
     poor = Scores(visible=Score.of(0.5, 0.5), exposed=Score.of(0.9, 0.9), objects=Score.of(0.9, 0.9))
     mission = team(2, flight={"separation_m": 1.2})
     run = RunFolder(tmp_path, mission)
-    run.record_tick(0, 0.0, {1: (0, 0, 1, 0, 1), 2: (1.1, 0, 1, 0, 1)}, {}, {}, {})
+    run.record_tick(0, 0.0, {1: (0, 0, 1, 0, 1), 2: (1.1, 0, 1, 0, 1)}, {})
     final = Metrics(0.0, 0, 0.1, poor, 0, 0)
     run.record_metrics(final)
     run.finish(final, floor_baseline=FLOOR, phi_sha256="0", wall_time_s=1.0, exit_reason="stopped")

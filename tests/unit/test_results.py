@@ -22,6 +22,7 @@ from ground_station.evaluation import Score, Scores
 from ground_station.mesh_files import mesh_sha256
 from ground_station.results import Metrics, RunFolder, versions
 from protocol.errors import MissionError, StorageError
+from protocol.messages import Control
 from protocol.mission import Drone, Mission
 
 MISSION = Mission(
@@ -47,14 +48,21 @@ def metrics(tick: int, scores: Scores | None = SCORES) -> Metrics:
     return Metrics(time_s=tick / 20, tick=tick, importance=0.4321, scores=scores, jumps=3, keyframes=42)
 
 
+def decision(*, solve_s: float, slack: float, outcome: str) -> Control:
+    return Control.model_construct(solve_s=solve_s, slack=slack, outcome=outcome, telemetry_age_s=0.01)
+
+
 def fly(run: RunFolder, first: int, last: int) -> None:
     """Two drones that come nearer by 1 cm a tick; drone 4 falls silent at tick 7 and brakes at every fourth."""
     for tick in range(first, last):
         poses = {1: (0.0, 0.0, 2.0, 0.1, 1.2), 4: (3.0 - 0.01 * tick, 0.0, 2.0, 0.2, 1.3)}
         if tick == 7:
             del poses[4]
-        fallback = {1: "", 4: "infeasible" if tick % 4 == 0 else ""}
-        run.record_tick(tick, tick / 20, poses, {1: 0.001, 4: 0.002}, {1: 0.0, 4: 0.5}, fallback)
+        controls = {
+            1: decision(solve_s=0.001, slack=0.0, outcome="solved"),
+            4: decision(solve_s=0.002, slack=0.5, outcome="infeasible" if tick % 4 == 0 else "solved"),
+        }
+        run.record_tick(tick, tick / 20, poses, controls)
 
 
 def finish(run: RunFolder, tick: int = 10) -> dict[str, object]:
@@ -88,9 +96,9 @@ def test_metrics_rows_can_be_read_while_the_run_goes_on(folder: RunFolder) -> No
 
 def test_a_row_shows_the_nearest_approach_since_the_row_before(folder: RunFolder) -> None:
     for tick, distance in enumerate([5.0, 1.2, 5.0]):
-        folder.record_tick(tick, tick / 20, {1: (0, 0, 1, 0, 1), 4: (distance, 0, 1, 0, 1)}, {}, {}, {})
+        folder.record_tick(tick, tick / 20, {1: (0, 0, 1, 0, 1), 4: (distance, 0, 1, 0, 1)}, {})
     folder.record_metrics(metrics(3))
-    folder.record_tick(3, 0.15, {1: (0, 0, 1, 0, 1), 4: (4.0, 0, 1, 0, 1)}, {}, {}, {})
+    folder.record_tick(3, 0.15, {1: (0, 0, 1, 0, 1), 4: (4.0, 0, 1, 0, 1)}, {})
     folder.record_metrics(metrics(4))
     assert [row["min_separation_m"] for row in rows(folder.path / "metrics.csv")] == ["1.2", "4.0"]
     assert finish(folder)["min_separation_m"] == 1.2
@@ -99,7 +107,7 @@ def test_a_row_shows_the_nearest_approach_since_the_row_before(folder: RunFolder
 def test_what_a_run_does_not_have_stays_empty(tmp_path: Path) -> None:
     alone = MISSION.model_copy(update={"drones": MISSION.drones[:1]})
     run = RunFolder(tmp_path, alone)
-    run.record_tick(0, 0.0, {1: (0, 0, 1, 0, 1)}, {}, {}, {})
+    run.record_tick(0, 0.0, {1: (0, 0, 1, 0, 1)}, {})
     run.record_metrics(metrics(1, scores=None))
     run.finish(metrics(1, scores=None), floor_baseline=None, phi_sha256="0", wall_time_s=1.0, exit_reason="stopped")
     run.close()
@@ -308,7 +316,7 @@ def test_after_a_crash_rows_and_trajectories_go_on(folder: RunFolder) -> None:
 @pytest.mark.parametrize("set_aside", [False, True])
 def test_the_smallest_separation_outlives_a_crash(folder: RunFolder, set_aside: bool) -> None:
     for tick, distance in enumerate([5.0, 1.2, 5.0]):
-        folder.record_tick(tick, tick / 20, {1: (0, 0, 1, 0, 1), 4: (distance, 0, 1, 0, 1)}, {}, {}, {})
+        folder.record_tick(tick, tick / 20, {1: (0, 0, 1, 0, 1), 4: (distance, 0, 1, 0, 1)}, {})
     folder.record_metrics(metrics(2))
     again = crash(folder)
     if set_aside:
@@ -316,7 +324,7 @@ def test_the_smallest_separation_outlives_a_crash(folder: RunFolder, set_aside: 
         again.close()
         again = RunFolder(again.path, MISSION)
     assert again.min_separation_m == 1.2
-    again.record_tick(9, 0.45, {1: (0, 0, 1, 0, 1), 4: (4.0, 0, 1, 0, 1)}, {}, {}, {})
+    again.record_tick(9, 0.45, {1: (0, 0, 1, 0, 1), 4: (4.0, 0, 1, 0, 1)}, {})
     again.record_metrics(metrics(9))
     assert finish(again)["min_separation_m"] == 1.2
     assert rows(again.path / "metrics.csv")[-1]["min_separation_m"] == "4.0"
