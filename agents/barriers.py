@@ -9,7 +9,6 @@ set, also when u is constant over a tick of length h <= 1/(2a): b falls at most 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,6 +17,7 @@ from numba import njit
 
 from protocol.geometry import Floats
 from protocol.mission import Flight, Mission
+from protocol.separation import top_speed, widened_separation
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,32 +49,9 @@ class Rows:
         return float(self.barriers[chosen].min()) if chosen else without
 
 
-ROOT_STEPS = 40
-"""Newton steps; from d + lag each at least takes a third off the distance to the root, at the end it squares it."""
-
-
 def predicted_pose(pose: Floats, velocity: Floats, flight: Flight) -> Floats:
     """y = p + tau v, (5,)."""
     return pose + flight.response_time_s * velocity
-
-
-def top_speed(flight: Flight) -> float:
-    """Largest speed in m/s when every component is at its bound."""
-    return math.sqrt(3) * flight.speed_max_mps
-
-
-def widened_separation(flight: Flight) -> float:
-    """Separation D of predicted positions that keeps true positions ``separation_m`` apart, metres.
-
-    While the predicted offset stays at least D away from the origin and moves at most at V, its direction turns at
-    most at w = V / D, and its moving average over exp(-t / tau) keeps at least D / (1 + (w tau)^2) along the
-    present direction. D is the positive root of D / (1 + (V tau / D)^2) = d, that is of D^3 - d D^2 - d (V tau)^2.
-    """
-    distance, lag = flight.separation_m, 2 * top_speed(flight) * flight.response_time_s
-    wide = distance + lag
-    for _ in range(ROOT_STEPS):  # Newton's steps fall towards the root and never past it: the cubic is convex there
-        wide -= (wide * wide * (wide - distance) - distance * lag * lag) / (wide * (3 * wide - 2 * distance))
-    return wide
 
 
 REGION = ("region:-x", "region:-y", "region:-z", "region:+x", "region:+y", "region:+z")

@@ -11,14 +11,17 @@ from typing import Protocol
 
 import numpy as np
 
-from agents.barriers import FIXED_ROWS, Barriers, Neighbour, Rows, predicted_pose, top_speed
+from agents.barriers import FIXED_ROWS, Barriers, Neighbour, Rows, predicted_pose
 from agents.quadratic_program import Outcome, QuadraticProgram
 from protocol.geometry import Floats
 from protocol.importance import SamplingTerms
 from protocol.mission import Mission
+from protocol.separation import top_speed
 
-DESCENT_WEIGHT = 1e3
-"""How much more a wished descent counts than effort: it is flown to a thousandth."""
+WISH_WEIGHT = 1e3
+"""How much more a wished velocity counts than effort: it is flown to a thousandth."""
+
+STAY: Floats = np.zeros(5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,10 +45,8 @@ class Planner(Protocol):
         """Own ``pose`` and ``velocity`` (5,); the field's ``terms``; ``cells`` = |V_i|."""
         ...
 
-    def hold(
-        self, pose: Floats, velocity: Floats, neighbours: Sequence[Neighbour], descent_mps: float = 0.0
-    ) -> Decision:
-        """Stay, or come down, as far as the strict rows allow; they may also make the drone give way."""
+    def steer(self, pose: Floats, velocity: Floats, neighbours: Sequence[Neighbour], wish: Floats = STAY) -> Decision:
+        """Fly ``wish`` (5,), as far as the strict rows allow; they may also make a drone that stays give way."""
         ...
 
 
@@ -70,12 +71,12 @@ class CoverageController:
         xi2 = a1 * (sampling - cells * settings.coverage_rate_per_s) - decay * decay * terms.second
         return self._filter(pose, velocity, neighbours, xi1, xi2, sampling)
 
-    def hold(
-        self, pose: Floats, velocity: Floats, neighbours: Sequence[Neighbour], descent_mps: float = 0.0
-    ) -> Decision:
-        """The same program with another wish: xi1 . u + xi2 >= 0 means "fall at ``descent_mps``", or nothing at all."""
-        downwards = np.array([0.0, 0.0, -DESCENT_WEIGHT if descent_mps > 0 else 0.0, 0.0, 0.0])
-        return self._filter(pose, velocity, neighbours, downwards, -DESCENT_WEIGHT * descent_mps, 0.0)
+    def steer(self, pose: Floats, velocity: Floats, neighbours: Sequence[Neighbour], wish: Floats = STAY) -> Decision:
+        """The same program with another question: xi1 . u + xi2 >= 0 means "as fast as ``wish``, along it", and nothing
+        at all where the wish is to stay."""
+        speed = float(np.linalg.norm(wish))
+        along = wish / speed if speed > 0 else wish
+        return self._filter(pose, velocity, neighbours, WISH_WEIGHT * along, -WISH_WEIGHT * speed, 0.0)
 
     def _filter(
         self,

@@ -10,10 +10,11 @@
     |-- JournalError        a journal that cannot be written or read back
     |   `-- JournalDamaged  ... because what it holds is not what was written
     |-- StorageError        another file of the run that the disk refuses
+    |-- VehicleError        a vehicle that cannot be connected, is not fit to fly, or refuses what it is told
     |-- ReconstructionError input that the reconstructor cannot work with
     `-- ProcessError        a process of the run that failed
 
-Errors of zenoh, OSQP, Open3D and the like are mapped to these at the edge where they arise. Outcomes of the
+Errors of zenoh, MAVSDK, OSQP, Open3D and the like are mapped to these at the edge where they arise. Outcomes of the
 quadratic program are values, not errors (`agents.quadratic_program`).
 """
 
@@ -64,6 +65,10 @@ class JournalDamaged(JournalError):
 
 class StorageError(CovreconError):
     pass
+
+
+class VehicleError(CovreconError):
+    """A vehicle that cannot be connected, is not fit to fly, or refuses what it is told."""
 
 
 class ReconstructionError(CovreconError):

@@ -8,23 +8,15 @@ are that paper's, and departures from it are listed in ARCHITECTURE.md.
 from __future__ import annotations
 
 import math
+import re
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from protocol.geometry import Intrinsics
-
-Metres = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Vector = tuple[Metres, Metres, Metres]
-Angle = Annotated[float, Field(allow_inf_nan=False)]
-
-
-class Settings(BaseModel):
-    """A table of the mission file: unknown keys are refused, values never change after loading."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, use_attribute_docstrings=True)
+from protocol.separation import widened_separation
+from protocol.settings import Angle, Metres, NonNegative, Positive, Settings, Vector
+from protocol.vehicle_settings import Autopilot, Vehicles
 
 
 class Box(Settings):
@@ -90,6 +82,8 @@ class Flight(Box):
     upper_m: Vector = (4.0, 4.0, 5.0)
     separation_m: Positive = 1.0
     """d: distance that any two drones keep, centre to centre."""
+    position_error_m: NonNegative = 0.0
+    """How far a vehicle's estimate of its position may be off; by their estimates two drones keep d and twice this."""
     speed_max_mps: Positive = 0.5
     """Bound of each velocity component."""
     turn_rate_max_radps: Positive = 0.5
@@ -103,6 +97,11 @@ class Flight(Box):
     """Range of the gimbal's depression angle."""
     setpoint_timeout_s: Positive = 0.5
     """A vehicle whose setpoints stop for so long is braked, whatever the control task does."""
+
+    @property
+    def estimated_separation_m(self) -> float:
+        """What two estimates must keep so that the vehicles keep ``separation_m``."""
+        return self.separation_m + 2 * self.position_error_m
 
     @property
     def velocity_limits(self) -> tuple[float, float, float, float, float]:
@@ -191,6 +190,8 @@ class Camera(Settings):
     keyframe_angle_rad: Annotated[float, Field(gt=0, le=math.pi)] = math.radians(15)
     """... or turned so far."""
     jpeg_quality: Annotated[int, Field(ge=30, le=100)] = 90
+    latency_s: NonNegative = 0.0
+    """Of a real camera: from exposure until its frame is read here; images are posed at arrival less this."""
 
     def intrinsics(self) -> Intrinsics:
         return Intrinsics.from_field_of_view(self.width_px, self.height_px, self.horizontal_fov_rad)
@@ -254,7 +255,14 @@ class Replication(Settings):
 class Drone(Settings):
     id: Annotated[int, Field(ge=1, le=255)]
     start: tuple[Metres, Metres, Metres, Angle, Angle]
-    """x, y, z in metres, yaw, pitch (depression) in radians."""
+    """x, y, z in metres, yaw, pitch (depression) in radians. A vehicle that takes off stands below and climbs to z."""
+    url: str = ""
+    """MAVSDK connection of this drone's vehicle; empty: counted up from ``vehicles.url``."""
+    system_id: Annotated[int, Field(ge=0, le=255)] = 0
+    """MAVLink system id that its vehicle must have; 0: the drone's id."""
+    camera: str = ""
+    """This drone's real camera: an RTSP URL, a V4L2 device such as /dev/video0, or a video file. Empty: the simulator
+    renders what it would see."""
 
 
 class Mission(Settings):
@@ -274,6 +282,8 @@ class Mission(Settings):
     camera: Camera = Camera()
     reconstruction: Reconstruction = Reconstruction()
     simulation: Simulation = Simulation()
+    vehicles: Vehicles = Vehicles()
+    autopilot: Autopilot = Autopilot()
     transport: Transport = Transport()
     replication: Replication = Replication()
     drones: Annotated[tuple[Drone, ...], Field(min_length=1)]
@@ -281,6 +291,17 @@ class Mission(Settings):
     @property
     def tick_s(self) -> float:
         return 1.0 / self.controller.rate_hz
+
+    def drone(self, number: int) -> Drone:
+        """The drone with this id. Raises `StopIteration` when there is none."""
+        return next(drone for drone in self.drones if drone.id == number)
+
+    def vehicle_url(self, drone: Drone) -> str:
+        """The drone's own, or that of ``vehicles`` counted up by the drone's place in the mission."""
+        if drone.url:
+            return drone.url
+        host, _, port = self.vehicles.url.rpartition(":")
+        return f"{host}:{int(port) + self.drones.index(drone)}"
 
     @model_validator(mode="after")
     def _parts_fit_together(self) -> Self:
@@ -313,8 +334,40 @@ class Mission(Settings):
                 f"flight.pitch_limits_rad: {high - low:g} apart, must be at least {2 * turn:g}:"
                 " the gimbal could pass a limit within one tick"
             )
+        if self.vehicles.kind == "px4":
+            faults += self._vehicle_faults()
+        else:
+            faults += [
+                f'drones.{index}.camera: a real camera needs a real vehicle, vehicles.kind = "px4"'
+                for index, drone in enumerate(self.drones)
+                if drone.camera
+            ]
         if self.reconstruction.nearest_m >= self.reconstruction.farthest_m:
             faults.append("reconstruction.nearest_m: must be less than farthest_m")
         if faults:
             raise ValueError("\n".join(faults))
         return self
+
+    def _vehicle_faults(self) -> list[str]:
+        """Two agents on one vehicle, two vehicles that MAVSDK would take for one, or two that cannot land at home."""
+        if not re.fullmatch(r"[a-z]+://[^:]*:\d+", self.vehicles.url):
+            return [f"vehicles.url: {self.vehicles.url!r} is no connection with a port, like udpin://127.0.0.1:14540"]
+        faults = []
+        urls: dict[str, int] = {}
+        systems: dict[int, int] = {}
+        for index, drone in enumerate(self.drones):
+            url, system = self.vehicle_url(drone), drone.system_id or drone.id
+            if url in urls:
+                faults.append(f"drones.{index}.url: {url} is drone {urls[url]}'s already")
+            if system in systems:
+                faults.append(f"drones.{index}.system_id: {system} is drone {systems[system]}'s already")
+            for other in self.drones[:index]:
+                gap, room = math.dist(drone.start[:2], other.start[:2]), widened_separation(self.flight)
+                if gap < room:
+                    faults.append(
+                        f"drones.{index}.start: {gap:.2f} m beside drone {other.id}; to take off and land it takes"
+                        f" {room:.2f} m, flight.separation_m and what lag and position_error_m add"
+                    )
+            urls.setdefault(url, drone.id)
+            systems.setdefault(system, drone.id)
+        return faults

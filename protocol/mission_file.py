@@ -24,16 +24,21 @@ TEAM_MAX = 255
 """Drones; what ids allow."""
 
 
-def load_mission(path: Path, *, drones: int | None = None, seed: int | None = None) -> Mission:
+def load_mission(
+    path: Path, *, drones: int | None = None, seed: int | None = None, vehicles: Mapping[str, str] | None = None
+) -> Mission:
     """Read and check a mission: TOML, or JSON as `mission_to_json` writes it (``.json``).
 
     ``drones`` sets the team's size: the file's first drones, then more placed by `protocol.formation`. ``seed``
-    replaces the file's. A scene given as a path becomes absolute, so that the mission may be stored elsewhere.
+    replaces the file's, and ``vehicles`` keys of its table of that name. A scene given as a path becomes absolute, so
+    that the mission may be stored elsewhere.
     Raises `MissionError` with one fault a line.
     """
     raw, lines = _parse(path, _read(path))
     if seed is not None:
         raw["seed"] = seed
+    if vehicles and isinstance(table := raw.setdefault("vehicles", {}), dict):
+        table.update(vehicles)
     _resolve_scene(raw, path.parent)
     faults = _complete_team(raw, drones)
     mission, found = check(raw)
@@ -155,8 +160,8 @@ def _sentence(path: Path, lines: Mapping[KeyPath, int], fault: Fault) -> str:
 
 
 def _toml(table: Mapping[str, Any], path: tuple[str, ...] = ()) -> list[str]:
-    """Lines of a table: its own values, then its tables and arrays of tables."""
-    plain = {key: value for key, value in table.items() if not _is_tables(value)}
+    """Lines of a table: its own values, then its tables and arrays of tables; what is None is left out."""
+    plain = {key: value for key, value in table.items() if value is not None and not _is_tables(value)}
     lines = [f"{key} = {_toml_value(value)}" for key, value in plain.items()]
     for key, value in table.items():
         if _is_tables(value):

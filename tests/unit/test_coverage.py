@@ -26,6 +26,7 @@ MISSION = Mission(
 )
 POSE = np.array([0.2, -0.3, 1.4, 0.7, 1.25])
 STILL = np.zeros(5)
+DOWN = np.array([0.0, 0.0, -0.3, 0.0, 0.0])
 WISH = SamplingTerms(np.full(5, 300.0), 20.0, 5.0)
 CELLS = 30_000.0
 
@@ -214,22 +215,22 @@ def test_the_sampling_row_is_the_barrier_condition_of_the_drones_own_share_of_th
 
 
 def test_without_a_wish_a_drone_stays_where_it_is() -> None:
-    decision = CoverageController(MISSION, neighbours=1).hold(POSE, STILL, [beside(2, 2.0, 0.0, 0.0)])
+    decision = CoverageController(MISSION, neighbours=1).steer(POSE, STILL, [beside(2, 2.0, 0.0, 0.0)])
 
     assert decision.outcome == "solved"
     assert np.abs(decision.velocity).max() < 1e-4
 
 
 def test_a_drone_that_holds_gives_way_to_one_that_is_too_near() -> None:
-    decision = CoverageController(MISSION, neighbours=1).hold(POSE, STILL, [beside(2, 0.9, 0.0, 0.0)])
+    decision = CoverageController(MISSION, neighbours=1).steer(POSE, STILL, [beside(2, 0.9, 0.0, 0.0)])
 
     assert decision.velocity[0] < 0, "away from it"
 
 
 def test_a_wished_descent_is_flown_as_far_as_the_strict_rows_allow() -> None:
     controller = CoverageController(MISSION, neighbours=1)
-    free = controller.hold(POSE, STILL, [beside(2, 2.0, 0.0, 0.0)], descent_mps=0.3)
-    blocked = controller.hold(POSE, STILL, [beside(2, 0.0, 0.0, -1.1)], descent_mps=0.3)
+    free = controller.steer(POSE, STILL, [beside(2, 2.0, 0.0, 0.0)], DOWN)
+    blocked = controller.steer(POSE, STILL, [beside(2, 0.0, 0.0, -1.1)], DOWN)
 
     assert free.velocity[2] == pytest.approx(-0.3, rel=0.01)
     assert np.abs(free.velocity[:2]).max() < 0.01

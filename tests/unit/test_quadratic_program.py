@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from agents.barriers import FIXED_ROWS, Barriers, Neighbour, Rows, widened_separation
+from agents.barriers import FIXED_ROWS, Barriers, Neighbour, Rows
 from agents.quadratic_program import ACTIVE, EFFORT_FLOOR, TOLERANCE, QuadraticProgram, Solution
 from protocol.geometry import Floats
 from protocol.mission import Drone, Flight, Mission
+from protocol.separation import widened_separation
 
 EFFORT = 0.01
 ROOM = FIXED_ROWS + 4

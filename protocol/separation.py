@@ -1,0 +1,32 @@
+"""How far apart predicted positions must be kept so that vehicles that lag keep the mission's distance."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from protocol.mission import Flight
+
+ROOT_STEPS = 40
+"""Newton steps; from d + lag each at least takes a third off the distance to the root, at the end it squares it."""
+
+
+def top_speed(flight: Flight) -> float:
+    """Largest speed in m/s when every component is at its bound."""
+    return math.sqrt(3) * flight.speed_max_mps
+
+
+def widened_separation(flight: Flight) -> float:
+    """Separation D of predicted positions that keeps the drones' positions d apart, metres; d is
+    ``estimated_separation_m``.
+
+    While the predicted offset stays at least D away from the origin and moves at most at V, its direction turns at
+    most at w = V / D, and its moving average over exp(-t / tau) keeps at least D / (1 + (w tau)^2) along the
+    present direction. D is the positive root of D / (1 + (V tau / D)^2) = d, that is of D^3 - d D^2 - d (V tau)^2.
+    """
+    distance, lag = flight.estimated_separation_m, 2 * top_speed(flight) * flight.response_time_s
+    wide = distance + lag
+    for _ in range(ROOT_STEPS):  # Newton's steps fall towards the root and never past it: the cubic is convex there
+        wide -= (wide * wide * (wide - distance) - distance * lag * lag) / (wide * (3 * wide - 2 * distance))
+    return wide
