@@ -22,7 +22,8 @@ class Topic(Generic[M]):
     key: str
     """Key expression; ``{drone}`` stands for a drone's id."""
     message: type[M]
-    writer: Writer
+    writers: tuple[Writer, ...]
+    """Kinds of process that publish it."""
     priority: Priority
     queue: int
     """Messages kept for a slow reader; then the oldest is dropped and counted."""
@@ -40,18 +41,20 @@ class Topic(Generic[M]):
 
 _NO_AGE = float("inf")
 
-STATE = Topic("drone/{drone}/state", messages.DroneState, "agent", "INTERACTIVE_HIGH", 256, 0.4, True)
-KEYFRAME = Topic("drone/{drone}/keyframe", messages.Keyframe, "sim", "DATA_LOW", 256, _NO_AGE, True)
-SETPOINT = Topic("drone/{drone}/setpoint", messages.Setpoint, "agent", "REAL_TIME", 256, 0.5, True, express=True)
-TICK = Topic("clock/tick", messages.Tick, "sim", "REAL_TIME", 256, 0.5, True, express=True)
-JUMP = Topic("phi/jump", messages.Jump, "ground", "DATA_HIGH", 256, _NO_AGE, True)
-HEAD = Topic("phi/head", messages.JumpHead, "ground", "INTERACTIVE_LOW", 256, 2.0, True, express=True)
-JOURNAL = Topic("phi/journal", messages.JournalPage, "ground", "BACKGROUND", 16, _NO_AGE, False, queryable=True)
-DIGEST = Topic("phi/digest", messages.PhiDigest, "ground", "INTERACTIVE_LOW", 16, _NO_AGE, True)
-BLOCKS = Topic("phi/blocks", messages.PhiPage, "ground", "BACKGROUND", 16, _NO_AGE, False, queryable=True)
-DRONE_BLOCKS = Topic("drone/{drone}/phi", messages.PhiPage, "agent", "BACKGROUND", 16, _NO_AGE, False, queryable=True)
-PHASE = Topic("command/all", messages.MissionPhase, "ground", "REAL_TIME", 16, 2.0, True, express=True)
-STATUS = Topic("status", messages.Status, "ground", "INTERACTIVE_LOW", 4, 5.0, False)
+STATE = Topic("drone/{drone}/state", messages.DroneState, ("agent",), "INTERACTIVE_HIGH", 256, 0.4, True)
+KEYFRAME = Topic("drone/{drone}/keyframe", messages.Keyframe, ("agent", "sim"), "DATA_LOW", 256, _NO_AGE, True)
+SETPOINT = Topic("drone/{drone}/setpoint", messages.Setpoint, ("agent",), "REAL_TIME", 256, 0.5, True, express=True)
+TICK = Topic("clock/tick", messages.Tick, ("sim",), "REAL_TIME", 256, 0.5, True, express=True)
+JUMP = Topic("phi/jump", messages.Jump, ("ground",), "DATA_HIGH", 256, _NO_AGE, True)
+HEAD = Topic("phi/head", messages.JumpHead, ("ground",), "INTERACTIVE_LOW", 256, 2.0, True, express=True)
+JOURNAL = Topic("phi/journal", messages.JournalPage, ("ground",), "BACKGROUND", 16, _NO_AGE, False, queryable=True)
+DIGEST = Topic("phi/digest", messages.PhiDigest, ("ground",), "INTERACTIVE_LOW", 16, _NO_AGE, True)
+BLOCKS = Topic("phi/blocks", messages.PhiPage, ("ground",), "BACKGROUND", 16, _NO_AGE, False, queryable=True)
+DRONE_BLOCKS = Topic(
+    "drone/{drone}/phi", messages.PhiPage, ("agent",), "BACKGROUND", 16, _NO_AGE, False, queryable=True
+)
+PHASE = Topic("command/all", messages.MissionPhase, ("ground",), "REAL_TIME", 16, 2.0, True, express=True)
+STATUS = Topic("status", messages.Status, ("ground",), "INTERACTIVE_LOW", 4, 5.0, False)
 
 TOPICS: tuple[Topic[Message], ...] = (  # type: ignore[assignment]  # read-only use of an invariant generic
     STATE, KEYFRAME, SETPOINT, TICK, JUMP, HEAD, JOURNAL, DIGEST, BLOCKS, DRONE_BLOCKS, PHASE, STATUS,

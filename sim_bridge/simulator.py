@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,10 +20,13 @@ from protocol.bus import Bus, connect
 from protocol.errors import ProcessError
 from protocol.messages import JumpHead, Setpoint, Tick, VehicleSample
 from protocol.mission import Mission
+from sim_bridge.darkroom import Darkroom
 from sim_bridge.dynamics import VehicleBody
+from sim_bridge.observer import Observer
+from sim_bridge.roll_call import wait_for_everybody
 
 if TYPE_CHECKING:
-    from sim_bridge.photographer import Photographer, Shot
+    from sim_bridge.photographer import Photographer
 
 log = logging.getLogger(__name__)
 
@@ -35,13 +37,12 @@ GROUND_PATIENCE_S = 120.0
 lockstep, how long it stands still."""
 CHECK_S = 0.5
 """How often a tick is said again while the world stands still, for whoever has just come."""
-CAMERA_BACKLOG = 64
-"""Keyframes that may wait to be rendered in real time; beyond it they are lost and counted."""
 
 
 class Simulator:
     def __init__(self, mission: Mission, bus: Bus, photographer: Photographer | None, *, lockstep: bool) -> None:
-        self._mission, self._bus, self._photographer, self._lockstep = mission, bus, photographer, lockstep
+        self._mission, self._bus, self._lockstep = mission, bus, lockstep
+        self._darkroom = Darkroom(bus, photographer)
         self._bodies = {drone.id: VehicleBody.at(np.array(drone.start)) for drone in mission.drones}
         self._flown = dict.fromkeys(self._bodies, -1)
         self._silent: set[int] = set()
@@ -49,10 +50,6 @@ class Simulator:
         self._tick = 0
         self._beaten: Tick
         self._ground_seen_s = 0.0
-        self._keyframes = 0
-        self._lost_keyframes = 0
-        self._camera = ThreadPoolExecutor(1, thread_name_prefix="camera")
-        self._rendering: set[asyncio.Task[None]] = set()
         bus.on(topics.SETPOINT, self._hear_setpoint)
         bus.on(topics.HEAD, self._hear_head)
         bus.watch_lives()
@@ -78,13 +75,14 @@ class Simulator:
             ProcessError: nobody appeared, or the ground station stayed away.
         """
         self._bus.announce("sim")
-        await self._wait_for_everybody()
+        await wait_for_everybody(self._bus, self._mission)
         loop = asyncio.get_running_loop()
         began = loop.time()
         try:
             while self._head.phase != "finished":
                 self._publish(self._beat())
-                await self._photograph(self._tick)
+                poses = {drone: body.pose for drone, body in self._bodies.items()}
+                await self._darkroom.photograph(self._tick, poses, wait=self._lockstep)
                 if self._lockstep:
                     await self._wait_for_agents()
                     await self._wait_for_ground()
@@ -95,20 +93,7 @@ class Simulator:
                     body.step(self._mission.tick_s, self._tick * self._mission.tick_s, self._mission.flight)
                 self._tick += 1
         finally:
-            self._camera.shutdown(cancel_futures=True)
-        if self._lost_keyframes:
-            log.warning("%d keyframes were due faster than they could be rendered and are lost", self._lost_keyframes)
-
-    async def _wait_for_everybody(self) -> None:
-        """For as long as the mission allows; a drone that comes later joins in flight."""
-        patience_s = self._mission.simulation.start_patience_s
-        wanted = {"ground", *(f"drone/{drone}" for drone in self._bodies)}
-        if await self._bus.until(lambda: wanted <= self._bus.alive, patience_s):
-            return
-        missing = ", ".join(sorted(wanted - self._bus.alive))
-        if "ground" not in self._bus.alive or not self._live():
-            raise ProcessError(f"not started within {patience_s:g} s: {missing}")
-        log.error("not started within %g s: %s: going on without", patience_s, missing)
+            self._darkroom.close()
 
     def _live(self) -> list[int]:
         return [drone for drone in sorted(self._bodies) if self._is_live(drone)]
@@ -138,7 +123,7 @@ class Simulator:
             vehicles=tuple(vehicles),
             jump_epoch=self._head.epoch,
             next_jump=self._head.next_sequence,
-            keyframes=self._keyframes,
+            keyframes=self._darkroom.sent,
         )
 
     def _publish(self, beat: Tick) -> None:
@@ -153,29 +138,6 @@ class Simulator:
                 return False
             self._publish(self._beaten)
         return True
-
-    async def _photograph(self, tick: int) -> None:
-        if self._photographer is None:
-            return
-        shots = self._photographer.due(tick, {drone: body.pose for drone, body in self._bodies.items()})
-        if self._lockstep:
-            for shot in shots:
-                await self._shoot(self._photographer, shot)
-            return
-        for shot in shots:
-            if len(self._rendering) >= CAMERA_BACKLOG:
-                self._lost_keyframes += 1
-                continue
-            task = asyncio.create_task(self._shoot(self._photographer, shot))
-            self._rendering.add(task)
-            task.add_done_callback(self._rendering.discard)
-
-    async def _shoot(self, photographer: Photographer, shot: Shot) -> None:
-        def shoot() -> None:  # also sends, which may take long on a congested link
-            self._bus.put(topics.KEYFRAME, photographer.take(shot), shot.drone)
-
-        await asyncio.get_running_loop().run_in_executor(self._camera, shoot)
-        self._keyframes += 1
 
     async def _wait_for_agents(self) -> None:
         tick = self._tick
@@ -206,10 +168,14 @@ class Simulator:
 
 
 async def run_simulator(mission: Mission, endpoint: str, run: Path, *, lockstep: bool) -> None:
-    """Simulate the world of ``mission``; what is true of it is left in the run folder."""
+    """Simulate the world of ``mission``, or what its cameras see where autopilots fly; what is true of it is left in
+    the run folder."""
     photographer = await asyncio.to_thread(_make_photographer, mission, run)
     async with connect(endpoint, mission.name, lossless=lockstep) as bus:
-        await Simulator(mission, bus, photographer, lockstep=lockstep).run()
+        if mission.vehicles.kind == "px4":
+            await Observer(mission, bus, photographer).run()
+        else:
+            await Simulator(mission, bus, photographer, lockstep=lockstep).run()
 
 
 def _make_photographer(mission: Mission, run: Path) -> Photographer | None:

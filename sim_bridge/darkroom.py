@@ -1,0 +1,58 @@
+"""Keyframes from poses to the bus, beside the clock: rendered and sent on a thread of their own."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
+
+from protocol import topics
+from protocol.bus import Bus
+from protocol.geometry import Floats
+
+if TYPE_CHECKING:
+    from sim_bridge.photographer import Photographer, Shot
+
+log = logging.getLogger(__name__)
+
+BACKLOG = 64
+"""Keyframes that may wait to be rendered in real time; beyond it they are lost and counted."""
+
+
+class Darkroom:
+    def __init__(self, bus: Bus, photographer: Photographer | None) -> None:
+        """None: nobody has a camera."""
+        self._bus, self._photographer = bus, photographer
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="camera")
+        self._rendering: set[asyncio.Task[None]] = set()
+        self.sent = 0
+        """Keyframes so far."""
+        self.lost = 0
+
+    async def photograph(self, tick: int, poses: Mapping[int, Floats], *, wait: bool) -> None:
+        """Take the keyframes that are due at ``tick``; ``poses`` (5,) by drone. ``wait``: until they are sent."""
+        if self._photographer is None:
+            return
+        for shot in self._photographer.due(tick, poses):
+            if wait:
+                await self._shoot(self._photographer, shot)
+            elif len(self._rendering) >= BACKLOG:
+                self.lost += 1
+            else:
+                task = asyncio.create_task(self._shoot(self._photographer, shot))
+                self._rendering.add(task)
+                task.add_done_callback(self._rendering.discard)
+
+    async def _shoot(self, photographer: Photographer, shot: Shot) -> None:
+        def shoot() -> None:  # also sends, which may take long on a congested link
+            self._bus.put(topics.KEYFRAME, photographer.take(shot), shot.drone)
+
+        await asyncio.get_running_loop().run_in_executor(self._worker, shoot)
+        self.sent += 1
+
+    def close(self) -> None:
+        self._worker.shutdown(cancel_futures=True)
+        if self.lost:
+            log.warning("%d keyframes were due faster than they could be rendered and are lost", self.lost)
