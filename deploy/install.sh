@@ -53,14 +53,14 @@ install_packages() {
         # uv does not read pip's settings.
         export UV_FIND_LINKS=${UV_FIND_LINKS-${PIP_FIND_LINKS-$("$python" -m pip config get global.find-links 2>/dev/null || true)}}
         uv venv --quiet --allow-existing --python "$python" .venv
-        uv pip install --quiet --python .venv/bin/python --constraint constraints.txt --editable '.[ground]' --group dev
+        uv pip install --quiet --python .venv/bin/python --constraint constraints.txt --editable '.[ground,camera]' --group dev
     else
         "$python" -m venv .venv
         # --group came with pip 25.1.
         .venv/bin/python -m pip install --quiet --disable-pip-version-check 'pip>=25.1'
         # Setuptools' warning about editable installs is for others than `make`'s users.
         PYTHONWARNINGS=ignore .venv/bin/python -m pip install --disable-pip-version-check --progress-bar off \
-            --constraint constraints.txt --editable '.[ground]' --group dev | large_downloads
+            --constraint constraints.txt --editable '.[ground,camera]' --group dev | large_downloads
     fi
 }
 

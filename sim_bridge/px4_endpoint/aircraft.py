@@ -1,0 +1,152 @@
+"""One vehicle without its link: what PX4 and the airframe do from step to step. Time is given, nothing is sent."""
+
+from __future__ import annotations
+
+import math
+from typing import TypeAlias
+
+import numpy as np
+
+from protocol.mission import Drone, Mission
+from sim_bridge.px4_endpoint.battery import Battery
+from sim_bridge.px4_endpoint.body import Body, Wind
+from sim_bridge.px4_endpoint.commander import Commander, Situation
+from sim_bridge.px4_endpoint.estimator import Estimator
+from sim_bridge.px4_endpoint.frames import Geodetic, Vector, ned, unproject, world_yaw
+from sim_bridge.px4_endpoint.gimbal import Gimbal
+from sim_bridge.px4_endpoint.guidance import Estimate, Guidance, Target
+from sim_bridge.px4_endpoint.modes import Mode
+from sim_bridge.px4_endpoint.parameters import Parameters
+from sim_bridge.px4_endpoint.takeoff import Ground
+
+Pose: TypeAlias = tuple[float, float, float, float, float]
+
+HOME: Geodetic = (47.397742, 8.545594, 488.0)
+"""Origin of a world that says none: where PX4's own simulation stands."""
+LIFTING = (Mode.TAKEOFF, Mode.OFFBOARD, Mode.MANUAL, Mode.ALTCTL, Mode.POSCTL, Mode.STABILISED)
+"""Modes that may leave the ground."""
+
+
+class Aircraft:
+    """Stands at z = 0 below its start; its local frame has its origin there, or in the world's when the mission has no
+    ``vehicles.origin``."""
+
+    def __init__(self, mission: Mission, drone: Drone) -> None:
+        dice = np.random.default_rng([mission.seed, drone.id])
+        settings = mission.autopilot
+        x, y, _, yaw, pitch = drone.start
+        world = mission.vehicles.origin or HOME
+        here = ned((x, y, 0.0))
+        origin = here if mission.vehicles.origin else (0.0, 0.0, 0.0)
+        self.parameters = Parameters()
+        self.parameters.set("MAV_SYS_ID", drone.system_id or drone.id)
+        self.commander = Commander(self.parameters)
+        self.guidance = Guidance(self.parameters)
+        self.guidance.home = (here[0] - origin[0], here[1] - origin[1], here[2] - origin[2])
+        self.ground = Ground(self.parameters, settings.spool_up_s)
+        self.wind = Wind(settings, dice)
+        self.body = Body(here, world_yaw(yaw))
+        self.estimator = Estimator(origin, settings.position_noise_m, dice)
+        self.battery = Battery(settings.battery_s)
+        self.gimbal = Gimbal(self.parameters, settings.gimbal_rate_max_radps)
+        self.origin: Geodetic = unproject(world, origin)
+        """Of the local frame: GPS_GLOBAL_ORIGIN."""
+        self.faults: tuple[str, ...] = ()
+        """Red checks, by what PX4 calls them."""
+        self.commanded: Vector = (0.0, 0.0, 0.0)
+        self.now_s = 0.0
+        self._setpoint_s = -math.inf
+        self._flight = mission.flight
+        self._fixed_pitch = pitch if mission.vehicles.camera_mount == "fixed" else None
+        self._mode = self.commander.mode
+        self._armed = False
+        self._push_until_s = -math.inf
+
+    @property
+    def estimate(self) -> Estimate:
+        body, estimator = self.body, self.estimator
+        v, push = body.velocity, body.push
+        moving = (v[0] + push[0], v[1] + push[1], v[2] + push[2])
+        return Estimate(estimator.position(body.position), estimator.velocity(moving), body.yaw)
+
+    @property
+    def situation(self) -> Situation:
+        here = self.estimate
+        return Situation(
+            self.now_s,
+            self.now_s - self._setpoint_s < self.parameters["COM_OF_LOSS_T"],
+            self.ground.landed,
+            self.faults,
+            self.battery.share,
+            self._outside_fence(here.position),
+            self.guidance.took_off(here),
+        )
+
+    @property
+    def pose(self) -> Pose:
+        """Where the camera truly is: x, y, z, yaw, depression; world frame."""
+        x, y, z = ned(self.body.position)
+        if self._fixed_pitch is not None:
+            return (x, y, z, world_yaw(self.body.yaw), self._fixed_pitch - self.body.pitch)
+        return (x, y, z, world_yaw(self.body.yaw + self.gimbal.yaw.angle), -self.gimbal.pitch.angle)
+
+    def aim(self, target: Target, now_s: float) -> None:
+        """An offboard setpoint arrived."""
+        self.guidance.target = target
+        self._setpoint_s = now_s
+
+    def jump(self, by: Vector) -> None:
+        """The estimate moves at once by north, east, down; the vehicle does not."""
+        self.estimator.jump(by)
+        self.guidance.shift(by)
+
+    def push(self, velocity: Vector, seconds: float) -> None:
+        """Carry it along with this velocity, north, east, down, on top of what it flies."""
+        self.body.push = velocity
+        self._push_until_s = self.now_s + seconds
+
+    def step(self, now_s: float, dt: float) -> None:
+        """Advance by ``dt`` seconds to ``now_s``."""
+        self.now_s = now_s
+        if now_s > self._push_until_s:
+            self.body.push = (0.0, 0.0, 0.0)
+        self.wind.step(dt)
+        self.estimator.step(dt)
+        commander = self.commander
+        commander.step(self.situation)
+        self._follow_commander()
+        if commander.armed:
+            self.battery.drain(dt)
+            self._fly(now_s, dt)
+        else:
+            self.ground.step(now_s, dt, armed_s=None, on_ground=self.body.on_ground, wanted_down=0.0)
+            self.body.rest(dt)
+        self.gimbal.step(self.body.yaw, dt)
+
+    def _follow_commander(self) -> None:
+        armed, mode = self.commander.armed, self.commander.mode
+        if armed and not self._armed:
+            self.guidance.home = self.estimate.position
+        if mode is not self._mode or armed is not self._armed:
+            self.guidance.enter(mode, self.estimate)
+        self._mode, self._armed = mode, armed
+
+    def _fly(self, now_s: float, dt: float) -> None:
+        velocity, yaw_rate = self.guidance.command(self._mode, self.estimate)
+        down = velocity[2] if self.ground.airborne or self._mode in LIFTING else 0.0
+        climb = self.ground.step(
+            now_s, dt, armed_s=self.commander.armed_s, on_ground=self.body.on_ground, wanted_down=down
+        )
+        self.commanded = (velocity[0], velocity[1], max(down, -climb))
+        if not self.ground.airborne:
+            self.body.rest(dt)
+            return
+        error = self.estimator.velocity_error  # the controller sees the estimate, so its error is flown
+        n, e, d = self.commanded
+        self.body.fly((n - error[0], e - error[1], d - error[2]), yaw_rate, self.wind, self._flight, dt)
+
+    def _outside_fence(self, position: Vector) -> bool:
+        home, parameters = self.guidance.home, self.parameters
+        wide, high = parameters["GF_MAX_HOR_DIST"], parameters["GF_MAX_VER_DIST"]
+        far = math.hypot(position[0] - home[0], position[1] - home[1])
+        return (wide > 0 and far > wide) or (high > 0 and home[2] - position[2] > high)

@@ -1,0 +1,251 @@
+"""Whole flights of the endpoint's vehicle without a link, in simulated time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+
+from protocol.mission import Drone, Mission
+from protocol.vehicle_settings import Autopilot, Vehicles
+from sim_bridge.px4_endpoint.aircraft import HOME, Aircraft
+from sim_bridge.px4_endpoint.frames import world_yaw
+from sim_bridge.px4_endpoint.guidance import Target
+from sim_bridge.px4_endpoint.modes import Mode
+
+DT = 0.01
+START = (1.0, 2.0, 2.0, 0.4, 1.3)
+ORIGIN = (47.0, 8.0, 400.0)
+QUIET = Autopilot(position_noise_m=0.0)
+
+
+class Flight:
+    """An aircraft and its time; ``setpoint`` is repeated at every step, as long as there is one."""
+
+    def __init__(
+        self, *, origin: tuple[float, float, float] | None = ORIGIN, settings: Autopilot = QUIET, **parameters: float
+    ) -> None:
+        drone = Drone(id=1, start=START)
+        mission = Mission(drones=(drone,), vehicles=Vehicles(kind="px4", origin=origin), autopilot=settings)
+        self.aircraft = Aircraft(mission, drone)
+        for name, value in {"COM_OBL_RC_ACT": 5, "MIS_TAKEOFF_ALT": 2.0, **parameters}.items():
+            self.aircraft.parameters.set(name, value)
+        self.now_s = 0.0
+        self.setpoint: Target | None = None
+        self.run(0.1)
+
+    def run(self, seconds: float) -> None:
+        self.until(lambda: False, seconds, required=False)
+
+    def until(self, condition: Callable[[], bool], patience_s: float, *, required: bool = True) -> None:
+        for _ in range(round(patience_s / DT)):
+            if condition():
+                return
+            self.now_s += DT
+            if self.setpoint is not None:
+                self.aircraft.aim(self.setpoint, self.now_s)
+            self.aircraft.step(self.now_s, DT)
+        assert not required, f"not within {patience_s} s"
+
+    @property
+    def mode(self) -> Mode:
+        return self.aircraft.commander.mode
+
+    def command(self, mode: Mode) -> bool:
+        return self.aircraft.commander.command(mode, self.aircraft.situation)
+
+    def take_off(self) -> None:
+        assert self.aircraft.commander.arm(self.aircraft.situation)
+        assert self.command(Mode.TAKEOFF)
+        self.until(lambda: self.mode is Mode.HOLD, 20)
+        self.run(4)
+
+    def fly(self, north: float, east: float, down: float, yaw: float = math.nan) -> None:
+        self.setpoint = Target(None, (north, east, down), yaw, math.nan)
+        self.run(DT)
+        assert self.command(Mode.OFFBOARD)
+
+
+def test_it_stands_below_its_start_looking_where_the_camera_shall_look() -> None:
+    x, y, z, yaw, pitch = Flight().aircraft.pose
+    assert (x, y, z, yaw) == pytest.approx((START[0], START[1], 0.0, START[3]))
+    assert pitch == 0  # the gimbal has not been told yet
+
+
+def test_its_local_frame_starts_where_it_stands_and_its_global_origin_says_where_that_is() -> None:
+    aircraft = Flight().aircraft
+    assert aircraft.estimate.position == pytest.approx((0.0, 0.0, 0.0))
+    assert math.radians(aircraft.origin[0] - ORIGIN[0]) * 6371000 == pytest.approx(START[1], abs=1e-3)
+
+
+def test_without_an_origin_its_local_frame_is_the_worlds() -> None:
+    aircraft = Flight(origin=None).aircraft
+    assert aircraft.estimate.position == pytest.approx((START[1], START[0], 0.0))
+    assert aircraft.origin == HOME
+
+
+def test_it_takes_off_to_the_height_asked_for_after_its_spool_up() -> None:
+    flight = Flight(settings=Autopilot(position_noise_m=0.0, spool_up_s=2.0))
+    flight.aircraft.commander.arm(flight.aircraft.situation)
+    flight.command(Mode.TAKEOFF)
+    flight.run(1.9)
+    assert flight.aircraft.pose[2] == 0
+    flight.until(lambda: flight.mode is Mode.HOLD, 20)
+    assert flight.aircraft.pose[2] == pytest.approx(1.2, abs=0.1)  # NAV_MC_ALT_RAD below
+    flight.run(6)
+    assert flight.aircraft.pose[2] == pytest.approx(2.0, abs=0.05)
+
+
+def test_it_flies_velocities_and_turns_to_the_yaw_asked_for() -> None:
+    flight = Flight()
+    flight.take_off()
+    before = flight.aircraft.pose
+    flight.fly(0.5, 0.2, -0.1, yaw=2.0)
+    flight.run(4)
+    after = flight.aircraft.pose
+    assert after[1] - before[1] == pytest.approx(0.5 * 4, abs=0.15)
+    assert after[0] - before[0] == pytest.approx(0.2 * 4, abs=0.1)
+    assert after[2] - before[2] == pytest.approx(0.1 * 4, abs=0.1)
+    assert after[3] == pytest.approx(world_yaw(2.0), abs=0.01)
+
+
+def test_it_flies_no_faster_than_its_parameters_allow() -> None:
+    flight = Flight(MPC_XY_VEL_MAX=1.0)
+    flight.take_off()
+    flight.fly(50.0, 0.0, 0.0)
+    flight.run(3)
+    assert flight.aircraft.body.velocity[0] == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_yaw_that_is_not_given_is_kept() -> None:
+    flight = Flight()
+    flight.take_off()
+    before = flight.aircraft.body.yaw
+    flight.fly(0.3, 0.0, 0.0)
+    flight.run(2)
+    assert flight.aircraft.body.yaw == pytest.approx(before)
+
+
+def test_offboard_takes_off_from_the_ground_too() -> None:
+    flight = Flight()
+    flight.fly(0.0, 0.0, -0.5)
+    assert flight.aircraft.commander.arm(flight.aircraft.situation)
+    flight.run(6)
+    assert flight.aircraft.pose[2] > 1.0
+
+
+def test_when_setpoints_stop_it_holds_and_goes_on_when_they_come_back() -> None:
+    flight = Flight()
+    flight.take_off()
+    flight.fly(0.5, 0.0, 0.0)
+    flight.run(1)
+    flight.setpoint = None
+    modes = []
+    for wait_s in (0.9, 2):
+        flight.run(wait_s)
+        modes.append(flight.mode)
+    assert modes == [Mode.OFFBOARD, Mode.HOLD]
+    assert math.hypot(*flight.aircraft.body.velocity) < 0.05
+    flight.setpoint = Target(None, (0.3, 0.0, 0.0), math.nan, math.nan)
+    flight.run(1)
+    assert flight.mode is Mode.OFFBOARD
+
+
+def test_without_a_remote_control_position_mode_sinks_lands_and_disarms() -> None:
+    flight = Flight(COM_OBL_RC_ACT=0)
+    flight.take_off()
+    flight.fly(0.2, 0.0, 0.0)
+    flight.setpoint = None
+    flight.until(lambda: flight.mode is Mode.POSCTL, 2)
+    flight.until(lambda: not flight.aircraft.commander.armed, 12)
+    assert flight.aircraft.pose[2] == 0
+
+
+def test_landing_takes_time_and_ends_disarmed() -> None:
+    flight = Flight()
+    flight.take_off()
+    began = flight.now_s
+    flight.command(Mode.LAND)
+    flight.until(lambda: flight.aircraft.ground.landed, 15)
+    assert flight.now_s - began > 2.0 / 0.7
+    assert flight.aircraft.commander.armed
+    flight.until(lambda: not flight.aircraft.commander.armed, 3)
+
+
+def test_it_returns_to_where_it_armed_and_lands_there() -> None:
+    flight = Flight()
+    flight.take_off()
+    flight.fly(1.0, 1.0, 0.0)
+    flight.run(4)
+    assert math.dist(flight.aircraft.pose[:2], START[:2]) > 4
+    flight.setpoint = None
+    flight.command(Mode.RTL)
+    flight.until(lambda: not flight.aircraft.commander.armed, 60)
+    assert math.dist(flight.aircraft.pose[:2], START[:2]) < 0.4
+
+
+def test_it_stops_at_its_fence() -> None:
+    flight = Flight(GF_ACTION=2, GF_MAX_HOR_DIST=3.0)
+    flight.take_off()
+    flight.fly(1.0, 0.0, 0.0)
+    flight.until(lambda: flight.mode is Mode.HOLD, 10)
+    flight.run(2)
+    assert 3.0 < flight.aircraft.estimate.position[0] < 4.0
+
+
+def test_a_push_carries_it_away_against_its_will() -> None:
+    flight = Flight()
+    flight.take_off()
+    flight.aircraft.push((2.0, 0.0, 0.0), seconds=2.0)
+    before = flight.aircraft.pose[1]
+    flight.run(0.5)
+    assert flight.aircraft.estimate.velocity[0] > 1.0
+    flight.run(1.5)
+    assert flight.aircraft.pose[1] - before > 1.5
+    flight.run(8)
+    assert flight.aircraft.pose[1] == pytest.approx(before, abs=0.1)
+
+
+def test_a_jump_moves_the_estimate_and_not_the_vehicle() -> None:
+    flight = Flight()
+    flight.take_off()
+    true, believed = flight.aircraft.pose, flight.aircraft.estimate.position
+    flight.aircraft.jump((3.0, 0.0, 0.0))
+    assert flight.aircraft.estimate.position[0] == pytest.approx(believed[0] + 3.0)
+    flight.run(3)
+    assert flight.aircraft.pose == pytest.approx(true, abs=0.05)
+
+
+def test_a_pilots_sticks_fly_it_in_position_mode() -> None:
+    flight = Flight()
+    flight.take_off()
+    flight.aircraft.guidance.sticks = (0.0, 0.0, 0.0)
+    flight.command(Mode.POSCTL)
+    flight.run(3)
+    assert flight.aircraft.pose[2] == pytest.approx(2.0, abs=0.1)
+
+
+def test_its_battery_empties_in_flight_only() -> None:
+    flight = Flight(settings=Autopilot(position_noise_m=0.0, battery_s=100.0))
+    flight.run(5)
+    assert flight.aircraft.battery.share == 1.0
+    flight.take_off()
+    flying_s = flight.now_s - flight.aircraft.commander.armed_s
+    assert flight.aircraft.battery.share == pytest.approx(1 - flying_s / 100, abs=0.001)
+
+
+def test_the_same_mission_flies_the_same() -> None:
+    poses = []
+    for _ in range(2):
+        flight = Flight(settings=Autopilot(gust_mps=1.0, wind_mps=(1.0, 2.0)))
+        flight.take_off()
+        poses.append(flight.aircraft.pose)
+    assert poses[0] == poses[1]
+
+
+def test_it_holds_within_what_its_estimate_is_worth() -> None:
+    flight = Flight(settings=Autopilot(position_noise_m=0.05))
+    flight.take_off()
+    flight.run(10)
+    assert 0 < math.dist(flight.aircraft.pose[:3], (START[0], START[1], 2.0)) < 0.4
