@@ -6,23 +6,30 @@ planner's decision, setpoint out (ARCHITECTURE.md, "One tick"). In real time nob
 
 from __future__ import annotations
 
+import asyncio
 import logging
+import math
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from typing import Protocol
 
 import numpy as np
 
+from agents.barriers import Neighbour
+from agents.cameras.choice import make_feed
 from agents.coverage import CoverageController, Decision
+from agents.homing import down_wish, home_wish
+from agents.policies import Order, Policies, Situation, outside_m
+from agents.silence import WitnessedSilence
 from agents.team import Team
-from agents.vehicles.simulated import SimulatedVehicle
-from agents.vehicles.vehicle import Telemetry
+from agents.vehicles.choice import make_vehicle
+from agents.vehicles.vehicle import Condition, Telemetry
 from agents.watchdog import Watchdog
 from protocol import topics
 from protocol.bus import Bus, connect
-from protocol.clock import SimulatorClock
+from protocol.clock import clock_of
 from protocol.errors import ProcessError
 from protocol.geometry import Floats
 from protocol.importance import SamplingTerms, compile_kernels
@@ -43,8 +50,8 @@ SHARE_PERIOD_S = 1.0
 EARLIER_STATES, PASSED_STATES = 3, 8
 """States repeated in each message: with one message in ten lost, one state in ten thousand is. After ticks that passed
 by without one, more."""
-DESCENT_MPS = 0.3
-"""Of a drone that lands because the ground station stayed away."""
+LANDED_TICKS = 20
+"""How often a drone says that it stands on the ground before its process ends: the others need not wonder."""
 TOUCHDOWN_M = 0.1
 """Height above the flight region's floor from which the vehicle lands by itself."""
 UNLIMITED = 1e9
@@ -66,7 +73,7 @@ class Agent:
         *,
         lockstep: bool,
         now_s: Callable[[], float] = time.monotonic,
-        watchdog: Callable[[Callable[[], None], Callable[[], float], float], Guard] = Watchdog,
+        watchdog: Callable[..., Guard] = Watchdog,
     ) -> None:
         """``now_s``: monotonic seconds, callable from any thread, by which silence is judged in real time."""
         self._mission, self._drone, self._bus, self._lockstep = mission, drone, bus, lockstep
@@ -77,9 +84,19 @@ class Agent:
         self._replication = Replication(mission, drone)
         self._synchroniser = Synchroniser(bus, self._replication, drone)
         self._planner = CoverageController(mission, neighbours=len(starts) - 1)
-        self._vehicle = SimulatedVehicle(bus, drone, mission.flight, mission.tick_s)
-        self._clock = SimulatorClock(bus, lockstep=lockstep, now_s=now_s)
-        self._watchdog = watchdog(self._vehicle.stop, self._clock.now_s, mission.flight.setpoint_timeout_s)
+        self._clock = clock_of(mission, bus, lockstep=lockstep, now_s=now_s)
+        self._vehicle = make_vehicle(mission, drone, bus, now_s=self._clock.now_s, events=self._note_event)
+        self._policies = Policies(mission)
+        self._order = Order("fly")
+        self._silence = WitnessedSilence()
+        self._feed = make_feed(mission, drone, bus, now_s=self._clock.now_s)
+        self._watchdog = watchdog(
+            self._vehicle.stop,
+            self._clock.now_s,
+            mission.flight.setpoint_timeout_s,
+            give_up=self._vehicle.hold if mission.vehicles.setpoint_lost == "hold" else self._vehicle.land,
+            give_up_after_s=mission.vehicles.setpoint_lost_s,
+        )
         self._earlier: deque[tuple[int, Vector5]] = deque(maxlen=PASSED_STATES)
         self._published = -1
         self._tick = 0
@@ -89,7 +106,12 @@ class Agent:
         self._fallbacks = 0
         self._ground_heard_s = now_s()
         self._landing = False
+        self._landed_told = 0
+        self._starting_since_s = math.inf
+        self._jumps, self._jumped_at_s = 0, -math.inf
         self._finished = ""
+        self.mode: Mode = "starting"
+        """As its newest state says."""
         bus.on(topics.TICK, self._replication.hear_tick)
         bus.on(topics.STATE, self._hear_state, wakes=lockstep)
         bus.on(topics.JUMP, self._replication.hear_jump)
@@ -100,25 +122,52 @@ class Agent:
         bus.watch_lives()
 
     async def fly(self) -> None:
-        """Until the ground station ends the mission.
+        """From the vehicle's checks until the ground station has ended the mission and the vehicle is down.
 
         Raises:
+            VehicleError: it cannot fly.
             ProcessError: the simulator that carried the vehicle is gone.
         """
-        self._bus.announce(f"drone/{self._drone}")
-        async with self._synchroniser.running():
-            with self._watchdog:
-                try:
-                    while not self._finished:
-                        tick = await self._clock.next_tick(IDLE_TIMEOUT_S)
-                        if tick is not None:
-                            await self._step(tick)
-                        elif self._clock.is_gone and not self._finished:
-                            raise ProcessError(f"drone {self._drone}: the simulator is gone")
-                finally:
-                    self._vehicle.stop()
-                    self._vehicle.close()
+        try:
+            await self._vehicle.prepare()
+            if self._feed is not None:
+                self._feed.start()
+            self._bus.announce(f"drone/{self._drone}")
+            async with self._synchroniser.running():
+                with self._watchdog:
+                    try:
+                        await self._follow_clock()
+                    finally:
+                        self._vehicle.leave(hold=self._order.action == "hold" and bool(self._finished))
+        finally:
+            if self._feed is not None:
+                await asyncio.to_thread(self._feed.close)
+            self._vehicle.close()
         log.info("drone %d: finished: %s", self._drone, self._finished)
+
+    async def _follow_clock(self) -> None:
+        while not self._is_over():
+            tick = await self._clock.next_tick(IDLE_TIMEOUT_S)
+            if tick is not None:
+                await self._step(tick)
+            elif self._clock.is_gone and not self._finished:
+                raise ProcessError(f"drone {self._drone}: the simulator is gone")
+
+    def _is_over(self) -> bool:
+        """The mission, and for a vehicle that has to be brought down, its flight."""
+        if not self._finished:
+            return False
+        if self._mission.vehicles.kind == "simulated":
+            return True
+        authority = self._vehicle.condition().authority
+        if authority == "landed":
+            return self._landed_told >= LANDED_TICKS
+        return authority not in ("starting", "ours", "landing") or self._order == Order(
+            "hold", "mission end", self._finished
+        )
+
+    def _note_event(self, level: str, text: str) -> None:
+        log.log(logging.getLevelNamesMapping().get(level.upper(), logging.INFO), "vehicle: %s", text)
 
     def _hear_state(self, state: DroneState) -> None:
         if state.drone != self._drone:
@@ -142,29 +191,69 @@ class Agent:
         if self._clock.backlog:  # it is over already: phi catches up with it later, and nothing is decided
             self._earlier.extend((tick.tick, own.pose) for own in tick.vehicles if own.drone == self._drone)
             return
-        telemetry = self._vehicle.telemetry()
-        if telemetry is None or not self._is_sound(telemetry, tick):
+        telemetry, condition = self._vehicle.telemetry(), self._vehicle.condition()
+        order = self._obey_policies(telemetry, condition)
+        if condition.authority == "ready" and not self._finished and order.action == "wait":
+            self._vehicle.take_off()  # the first tick is the order to start
+        if telemetry is None or not self._is_sound(telemetry):
             log.error("tick %d: no sound telemetry: braking", tick.tick)
             self._vehicle.stop()
+            if order.action == "land":
+                self._vehicle.land()
             return
-        mode = self._mode()
+        self.mode = mode = self._mode(condition, order)
         self._publish(telemetry, tick.tick, mode)
+        if self._feed is not None and condition.authority == "ours":
+            self._feed.note_pose(telemetry.stamp_s, tick.tick, telemetry.pose, telemetry.rotation)
         terms = await self._advance(tick)
+        self._watchdog.feed()
+        if condition.authority != "ours":
+            self._control = None
+            if order.action == "land" and condition.authority == "starting":
+                self._vehicle.land()
+            return
 
+        age_s = max(0.0, self._clock.now_s() - telemetry.stamp_s)
         began = time.perf_counter()
         decision = self._decide(telemetry, tick, mode, terms)
         solve_s = time.perf_counter() - began
         sent = self._vehicle.send(tick.tick, decision.velocity)
-        self._watchdog.feed()
         if self._landing:
             self._vehicle.land()
-        self._report(tick.tick, decision, sent, solve_s)
+        self._report(tick.tick, decision, sent, solve_s, age_s)
+
+    def _obey_policies(self, telemetry: Telemetry | None, condition: Condition) -> Order:
+        now_s = self._clock.now_s()
+        if condition.authority != "starting":
+            self._starting_since_s = now_s
+        if condition.jumps > self._jumps:
+            self._jumps, self._jumped_at_s = condition.jumps, now_s
+        position = (0.0, 0.0, 0.0) if telemetry is None else telemetry.pose[:3].tolist()
+        situation = Situation(
+            authority=condition.authority,
+            authority_reason=condition.reason,
+            starting_s=now_s - self._starting_since_s,
+            battery=1.0 if telemetry is None else telemetry.battery,
+            telemetry_age_s=math.inf if telemetry is None else self._silence.look(telemetry.stamp_s, now_s),
+            outside_m=0.0 if telemetry is None else outside_m(self._mission.flight, position),
+            jump_age_s=now_s - self._jumped_at_s,
+            gimbal_lost=condition.gimbal_lost,
+            ground_away_s=0.0 if self._lockstep else self._now_s() - self._ground_heard_s,
+            finished=self._finished,
+        )
+        order = self._policies.decide(situation)
+        if order != self._order:
+            level = logging.INFO if order.action in ("fly", "wait") else logging.WARNING
+            log.log(level, "%s: %s %s", order.action, order.policy, f"({order.reason})" if order.reason else "")
+        self._order = order
+        return order
 
     def _publish(self, telemetry: Telemetry, tick: int, mode: Mode) -> None:
         state = self._state_of(telemetry, tick, mode)
         self._replication.hear_state(state)
         self._bus.put(topics.STATE, state, self._drone)
         self._published = tick
+        self._landed_told += mode == "landed"
         if not self._lockstep:  # where nothing is lost, nothing need be repeated
             self._earlier.append((tick, state.pose))
 
@@ -181,30 +270,49 @@ class Agent:
     def _decide(self, telemetry: Telemetry, tick: Tick, mode: Mode, terms: SamplingTerms) -> Decision:
         neighbours = self._team.neighbours(tick.tick, telemetry.delay_s)
         if mode in ("joining", "holding"):
-            return self._planner.hold(telemetry.pose, telemetry.velocity, neighbours)
-        if mode == "landing":
-            floor = self._mission.flight.lower_m[2]
-            self._landing = self._landing or telemetry.pose[2] - floor < TOUCHDOWN_M
-            return self._planner.hold(telemetry.pose, telemetry.velocity, neighbours, DESCENT_MPS)
+            return self._planner.steer(telemetry.pose, telemetry.velocity, neighbours)
+        if mode in ("returning", "landing"):
+            return self._bring_down(telemetry, neighbours, mode)
         if tick.time_s - self._cells_at >= SHARE_PERIOD_S:
             row, poses = self._replication.newest()
             self._cells = float(self._replication.replica.field.owned_cells(poses)[row])
             self._cells_at = tick.time_s
         return self._planner.decide(telemetry.pose, telemetry.velocity, neighbours, terms, self._cells)
 
-    def _mode(self) -> Mode:
+    def _bring_down(self, telemetry: Telemetry, neighbours: Sequence[Neighbour], mode: Mode) -> Decision:
+        flight, pose = self._mission.flight, telemetry.pose
+        low = pose[2] - flight.lower_m[2] < TOUCHDOWN_M
+        distance, speed = flight.estimated_separation_m, flight.speed_max_mps
+        wish = down_wish(pose, neighbours, distance, speed)
+        if mode == "returning":
+            home = self._mission.drone(self._drone).start
+            wish = home_wish(pose, home, neighbours, distance, speed)
+        self._landing = self._landing or bool(low and wish[2] < 0)
+        return self._planner.steer(pose, telemetry.velocity, neighbours, wish)
+
+    def _mode(self, condition: Condition, order: Order) -> Mode:
+        by_authority: dict[str, Mode] = {
+            "ready": "starting",
+            "starting": "starting",
+            "yielded": "yielded",
+            "landing": "landing",
+            "landed": "landed",
+            "lost": "yielded",
+        }
+        if condition.authority in by_authority:
+            return by_authority[condition.authority]
         if self._landing:
             return "landing"
+        by_order: dict[str, Mode] = {"hold": "holding", "return": "returning", "land": "landing"}
+        if order.action in by_order:
+            return by_order[order.action]
         if not self._replication.known:
             return "joining"
-        away_s = self._now_s() - self._ground_heard_s
-        if not self._lockstep and away_s > self._mission.replication.ground_patience_s:
-            return "holding" if self._mission.replication.ground_lost == "hold" else "landing"
         return "braking" if self._control is not None and self._control.outcome != "solved" else "flying"
 
-    def _is_sound(self, telemetry: Telemetry, tick: Tick) -> bool:
+    def _is_sound(self, telemetry: Telemetry) -> bool:
         """Alive, fresh and valid, in simulation too."""
-        fresh = abs(tick.time_s - telemetry.stamp_s) <= topics.TICK.max_age_s
+        fresh = self._clock.now_s() - telemetry.stamp_s <= self._mission.vehicles.telemetry_stale_s
         return fresh and bool(np.isfinite(telemetry.pose).all() and np.isfinite(telemetry.velocity).all())
 
     def _state_of(self, telemetry: Telemetry, tick: int, mode: Mode) -> DroneState:
@@ -223,7 +331,7 @@ class Agent:
             control=self._control,
         )
 
-    def _report(self, tick: int, decision: Decision, sent: Floats, solve_s: float) -> None:
+    def _report(self, tick: int, decision: Decision, sent: Floats, solve_s: float, age_s: float) -> None:
         if decision.outcome != "solved":
             self._fallbacks += 1
             if self._control is None or self._control.outcome != decision.outcome:
@@ -242,6 +350,7 @@ class Agent:
             active=decision.active,
             fallbacks=self._fallbacks,
             refused=self._bus.statistics.unused + self._replication.refused,
+            telemetry_age_s=age_s,
         )
 
 

@@ -19,6 +19,8 @@ class Team:
         self._last_seen: dict[int, tuple[int, Sequence[float], Sequence[float]]] = {
             drone: (0, start, (0.0,) * 5) for drone, start in starts.items() if drone != own
         }
+        self._landed: set[int] = set()
+        """Those that said so last: they stay where they are, also when their process has ended."""
 
     def hear(self, state: DroneState, now: int) -> None:
         """``now``: this drone's own newest tick. An older state never replaces a newer one, and none is younger than
@@ -27,6 +29,7 @@ class Team:
         known = self._last_seen.get(state.drone)
         if state.drone != self._own and (known is None or known[0] <= state.tick):
             self._last_seen[state.drone] = (min(state.tick, now + 1), state.pose, state.velocity)
+            (self._landed.add if state.mode == "landed" else self._landed.discard)(state.drone)
 
     def neighbours(self, tick: int, delay_s: float = 0.0) -> list[Neighbour]:
         """All the others at ``tick``, ascending by id; the longer silent, the larger, and the longer ``delay_s``, the
@@ -36,6 +39,9 @@ class Team:
         velocities = np.array([velocity for _, (_, _, velocity) in others]).reshape(-1, 5)
         predicted = predicted_pose(poses, velocities, self._flight)
         return [
-            Neighbour(drone, predicted[row, :3], max(0, tick - seen) * self._tick_s + delay_s)
+            Neighbour(drone, predicted[row, :3], self._silence_s(drone, tick - seen) + delay_s)
             for row, (drone, (seen, _, _)) in enumerate(others)
         ]
+
+    def _silence_s(self, drone: int, ticks: int) -> float:
+        return 0.0 if drone in self._landed else max(0, ticks) * self._tick_s

@@ -1,4 +1,4 @@
-"""Stops the vehicle when the control task falls silent, whatever the reason.
+"""Stops the vehicle when the control task falls silent, whatever the reason, and gives it up when that lasts.
 
 It runs in a thread of its own, because what it guards against is an event loop that is blocked or a task that died;
 an autopilot's own time-out does not help where its link layer keeps repeating the last setpoint.
@@ -7,6 +7,7 @@ an autopilot's own time-out does not help where its link layer keeps repeating t
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from collections.abc import Callable
 from types import TracebackType
@@ -20,39 +21,86 @@ CHECKS_PER_TIMEOUT = 5
 
 
 class Watchdog:
-    """Calls ``stop`` once each time ``now`` runs ``timeout_s`` past the last `feed`.
+    """Calls ``stop`` once each time ``now`` runs ``timeout_s`` past the last `feed`, and ``give_up`` once each time the
+    silence has lasted for ``give_up_after_s``.
 
     ``now`` gives seconds of monotonic time. In lockstep simulation that is the time of the vehicle's newest tick:
-    while the simulator waits, nothing moves, and waiting is not silence.
+    while the simulator waits, nothing moves, and waiting is not silence. Nor is all of the time during which nothing
+    ran here, the watchdog itself included (SIGSTOP, a suspended machine): the control task may be back as well, so
+    between two checks at most ``timeout_s`` counts towards giving up.
     """
 
-    def __init__(self, stop: Callable[[], None], now: Callable[[], float], timeout_s: float) -> None:
+    def __init__(
+        self,
+        stop: Callable[[], None],
+        now: Callable[[], float],
+        timeout_s: float,
+        *,
+        give_up: Callable[[], None] | None = None,
+        give_up_after_s: float = math.inf,
+    ) -> None:
+        """``give_up``: what leaves the vehicle to itself, holding or landing; called from the watchdog's thread."""
         self._stop, self._now, self._timeout_s = stop, now, timeout_s
+        self._give_up, self._give_up_after_s = give_up, give_up_after_s
         self._fed_at: float | None = None
         self._stopped_at: float | None = None
+        self._given_up_at: float | None = None
+        self._silent_since: float | None = None
+        self._checked_at = -math.inf
+        self._silence_s = 0.0
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
         self.stops = 0
-        """How often the vehicle had to be stopped."""
+        """How often the vehicle had to be stopped ..."""
+        self.given_up = 0
+        """... and to be given up."""
 
     def feed(self) -> None:
         """A setpoint was sent."""
         self._fed_at = self._now()
 
     def check(self) -> bool:
-        """Stop the vehicle if it is overdue; True if so. Silence before the first setpoint is not overdue.
+        """Stop the vehicle if it is overdue, give it up if it is so for long; True if either was done now. Silence
+        before the first setpoint is not overdue.
 
         Raises:
             CovreconError: the vehicle could not be told; the next check tries again.
         """
-        fed_at = self._fed_at
-        if fed_at is None or fed_at == self._stopped_at or self._now() - fed_at <= self._timeout_s:
+        # `feed` writes its own field alone: a setpoint sent at this very moment is watched again.
+        fed_at, now = self._fed_at, self._now()
+        if fed_at is None:
+            return False
+        silence_s = self._witnessed(fed_at, now)
+        try:
+            stopped = self._stop_if_overdue(fed_at, now)
+        finally:
+            given_up = self._give_up_if_overdue(fed_at, silence_s)
+        return stopped or given_up
+
+    def _witnessed(self, fed_at: float, now: float) -> float:
+        """The silence after ``fed_at``, without what exceeds ``timeout_s`` between two checks."""
+        if fed_at != self._silent_since:
+            self._silent_since, self._silence_s, self._checked_at = fed_at, 0.0, fed_at
+        self._silence_s += min(now - self._checked_at, self._timeout_s)
+        self._checked_at = now
+        return self._silence_s
+
+    def _stop_if_overdue(self, fed_at: float, now: float) -> bool:
+        if fed_at == self._stopped_at or now - fed_at <= self._timeout_s:
             return False
         self._stop()
-        # `feed` writes its own field alone: a setpoint sent at this very moment is watched again.
         self._stopped_at = fed_at
         self.stops += 1
         log.error("no setpoint for %.2f s: vehicle stopped", self._timeout_s)
+        return True
+
+    def _give_up_if_overdue(self, fed_at: float, silence_s: float) -> bool:
+        if self._give_up is None or fed_at == self._given_up_at or silence_s <= self._give_up_after_s:
+            return False
+        self._give_up()
+        self._given_up_at = fed_at
+        self.given_up += 1
+        log.error("no setpoint for %.2f s: vehicle left to itself", self._give_up_after_s)
         return True
 
     def _watch(self) -> None:
@@ -60,7 +108,7 @@ class Watchdog:
             try:
                 self.check()
             except CovreconError:
-                log.exception("the vehicle cannot be stopped; trying again")
+                log.exception("the vehicle cannot be told; trying again")
 
     def __enter__(self) -> Self:
         self._thread.start()

@@ -61,6 +61,8 @@ def run(
     headless: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     seed: Seed = None,
     restart: Annotated[int, Parameter(validator=Number(gte=0))] = 0,
+    vehicles: Annotated[Literal["simulated", "px4", "px4-endpoint"] | None, Parameter(show_default=False)] = None,
+    px4_url: Annotated[str | None, Parameter(show_default=False)] = None,
     out: Path = Path("runs"),
 ) -> int:
     """Fly a mission: router, simulator, ground station and one process a drone, all on this machine.
@@ -68,11 +70,16 @@ def run(
     Parameters
     ----------
     speed
-        "max": as fast as the machine allows, the same seed gives the same result. "1": real time.
+        "max": as fast as the machine allows, the same seed gives the same result. "1": real time, as PX4 always flies.
     headless
         Plain lines instead of the live table.
     restart
         How often each process but the simulator is started again when it dies.
+    vehicles
+        What carries the drones, instead of what the mission says: the internal simulator; PX4, hardware or SITL, that
+        is running already (docs/px4.md); or PX4-like vehicles of our own, started with the run.
+    px4_url
+        MAVSDK connection of the first PX4; each next one is at the next port.
     out
         Where the run's folder is made.
     """
@@ -84,14 +91,27 @@ def run(
     from deploy.progress import LiveDisplay, PlainDisplay
     from protocol.mission_file import load_mission
 
-    checked = load_mission(mission, drones=drones, seed=seed)
+    replaced = {}
+    if vehicles is not None:
+        replaced["kind"] = "simulated" if vehicles == "simulated" else "px4"
+    if px4_url is not None:
+        replaced["url"] = px4_url
+    checked = load_mission(mission, drones=drones, seed=seed, vehicles=replaced)
     console = Console(highlight=False)
     display = (
         LiveDisplay(console, checked)
         if console.is_terminal and not headless
         else PlainDisplay(lambda text: print(text, flush=True))
     )
-    return fly(checked, display, out=out, speed=speed, started=datetime.now(UTC), restarts=restart)
+    return fly(
+        checked,
+        display,
+        out=out,
+        speed="1" if checked.vehicles.kind == "px4" else speed,
+        started=datetime.now(UTC),
+        restarts=restart,
+        with_autopilots=vehicles == "px4-endpoint",
+    )
 
 
 @app.command
@@ -152,3 +172,4 @@ _process("agent", "agents", "one drone")
 _process("ground", "ground_station", "the ground station")
 _process("router", "protocol.router", "the router")
 _process("sim", "sim_bridge", "the simulator")
+_process("px4-endpoint", "sim_bridge.px4_endpoint", "PX4-like vehicles that speak MAVLink")

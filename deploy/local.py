@@ -2,8 +2,8 @@
 
 The ground station's end is the run's end. A drone that dies is told about and the others fly on; without the router,
 the ground station or the simulator nothing can go on, so their failure ends the run, unless they may be started again.
-The simulator may not: it is the world. Whatever happens, also to the launcher itself, no process and no socket stays
-behind (`deploy.reaper`).
+The simulator may not where it carries the vehicles: it is the world. Whatever happens, also to the launcher itself, no
+process and no socket stays behind (`deploy.reaper`).
 """
 
 from __future__ import annotations
@@ -39,7 +39,10 @@ LOG_BYTES = 16 * 1024
 BAD_INPUT = 2
 """Exit code of a process that refuses its mission, scene or endpoint; any other failure is 1."""
 
-Kind = Literal["router", "ground", "sim", "agent"]
+Kind = Literal["router", "ground", "sim", "observer", "autopilots", "agent"]
+"""sim and autopilots carry vehicles, an observer only watches them."""
+SERVANTS: tuple[Kind, ...] = ("router", "autopilots")
+"""Serve until the others are gone, and go with the group."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +64,13 @@ def environment(outer: Mapping[str, str]) -> dict[str, str]:
     return threads | dict(outer) | fixed
 
 
-def mission_roles(run: Path, endpoint: str, drones: Sequence[int], speed: str) -> list[Role]:
-    """Router, simulator, ground station and one agent a drone; all read ``mission.json`` in the run folder."""
+def mission_roles(
+    run: Path, endpoint: str, drones: Sequence[int], speed: str, *, px4: bool = False, autopilots: bool = False
+) -> list[Role]:
+    """Router, simulator, ground station and one agent a drone; all read ``mission.json`` in the run folder.
+
+    ``px4``: the vehicles are not the simulator's. ``autopilots``: they are PX4-like ones of our own.
+    """
 
     def role(name: str, kind: Kind, module: str, *more: str) -> Role:
         # -P keeps the folder that the launcher was called in from shadowing a package.
@@ -71,7 +79,8 @@ def mission_roles(run: Path, endpoint: str, drones: Sequence[int], speed: str) -
 
     return [
         role("router", "router", "protocol.router"),
-        role("sim", "sim", "sim_bridge"),
+        *([role("autopilots", "autopilots", "sim_bridge.px4_endpoint")] if autopilots else []),
+        role("sim", "observer" if px4 else "sim", "sim_bridge"),
         role("ground", "ground", "ground_station"),
         *(role(f"drone-{drone}", "agent", "agents", "--drone", str(drone)) for drone in drones),
     ]
@@ -125,7 +134,7 @@ class _Run:
     async def watch(self, interrupted: asyncio.Future[signal.Signals], group: int, settle_s: float) -> int:
         clock = asyncio.get_running_loop().time
         deadline = math.inf
-        while left := [role.name for role in self.waits.values() if role.kind != "router"]:
+        while left := [role.name for role in self.waits.values() if role.kind not in SERVANTS]:
             patience = None if deadline == math.inf else max(0.0, deadline - clock())
             watched: set[asyncio.Future[Any]] = {*self.waits, interrupted}
             await asyncio.wait(watched, timeout=patience, return_when=asyncio.FIRST_COMPLETED)
@@ -143,7 +152,7 @@ class _Run:
                 deadline = min(deadline, clock() + settle_s)
             if self._hopeless or (self._result != 0 and not self._drone_ended_well and not self._drones_left()):
                 return self._result
-        return self._result  # the router serves until the others are gone, and goes with the group
+        return self._result
 
     async def _take_end(self, role: Role, code: int, group: int) -> None:
         if code == 0:
@@ -156,10 +165,10 @@ class _Run:
         else:
             self._say(_obituary(role, code, self._logs))
             self._result = self._result or (BAD_INPUT if code == BAD_INPUT else 1)
-            self._hopeless |= role.kind != "agent"
+            self._hopeless |= role.kind not in ("agent", "observer")
 
     def _may_start_again(self, role: Role, code: int) -> bool:
-        mortal = role.kind != "sim" and code != BAD_INPUT and not self._over
+        mortal = role.kind not in ("sim", "autopilots") and code != BAD_INPUT and not self._over
         return mortal and self._restarted[role.name] < self._restarts
 
     def _drones_left(self) -> bool:

@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import Literal
 
 from agents.coverage import CoverageController
-from deploy.local import Role, mission_roles, supervise
+from deploy.local import SETTLE_S, Role, mission_roles, supervise
 from deploy.outcome import describe, read_outcome
 from deploy.progress import Display, follow
 from deploy.run_folder import make_run_folder, socket_endpoint, socket_folder_parent
@@ -21,16 +21,36 @@ from protocol.mission import Mission
 
 Speed = Literal["max", "1"]
 
+LANDING_S = 180.0
+"""What drones in the air get to come home and down once the ground station is done."""
 
-def fly(mission: Mission, display: Display, *, out: Path, speed: Speed, started: datetime, restarts: int = 0) -> int:
+
+def fly(
+    mission: Mission,
+    display: Display,
+    *,
+    out: Path,
+    speed: Speed,
+    started: datetime,
+    restarts: int = 0,
+    with_autopilots: bool = False,
+) -> int:
     """Run ``mission`` on this machine and say how it went; the exit code of the command.
 
-    A process that dies is started again up to ``restarts`` times, the simulator excepted.
+    A process that dies is started again up to ``restarts`` times, the simulator of vehicles excepted.
+    ``with_autopilots``: also start PX4-like vehicles of our own.
     """
     with TemporaryDirectory(prefix="covrecon-", dir=socket_folder_parent(), ignore_cleanup_errors=True) as private:
         endpoint = mission.transport.endpoint or socket_endpoint(Path(private))
         run = make_run_folder(out, mission, started, endpoint)
-        roles = mission_roles(run, endpoint, [drone.id for drone in mission.drones], speed)
+        roles = mission_roles(
+            run,
+            endpoint,
+            [drone.id for drone in mission.drones],
+            speed,
+            px4=mission.vehicles.kind == "px4",
+            autopilots=with_autopilots,
+        )
         with display:
             compile_everything(mission)
             display.say(f"{mission.name}: drones {len(mission.drones)}, seed {mission.seed}, run folder {run}")
@@ -62,7 +82,14 @@ async def _supervise_and_show(
 ) -> int:
     watching = asyncio.create_task(follow(endpoint, mission, display))
     try:
-        return await supervise(roles, logs=run / "logs", private=private, say=display.say, restarts=restarts)
+        return await supervise(
+            roles,
+            logs=run / "logs",
+            private=private,
+            say=display.say,
+            restarts=restarts,
+            settle_s=LANDING_S if mission.vehicles.kind == "px4" else SETTLE_S,
+        )
     finally:
         watching.cancel()
         with suppress(asyncio.CancelledError):

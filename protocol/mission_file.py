@@ -30,9 +30,8 @@ def load_mission(
     """Read and check a mission: TOML, or JSON as `mission_to_json` writes it (``.json``).
 
     ``drones`` sets the team's size: the file's first drones, then more placed by `protocol.formation`. ``seed``
-    replaces the file's, and ``vehicles`` keys of its table of that name. A scene given as a path becomes absolute, so
-    that the mission may be stored elsewhere.
-    Raises `MissionError` with one fault a line.
+    replaces the file's, and ``vehicles`` keys of its table of that name. A scene or a camera given as a path becomes
+    absolute, so that the mission may be stored elsewhere. Raises `MissionError` with one fault a line.
     """
     raw, lines = _parse(path, _read(path))
     if seed is not None:
@@ -40,6 +39,7 @@ def load_mission(
     if vehicles and isinstance(table := raw.setdefault("vehicles", {}), dict):
         table.update(vehicles)
     _resolve_scene(raw, path.parent)
+    _resolve_cameras(raw, path.parent)
     faults = _complete_team(raw, drones)
     mission, found = check(raw)
     faults += [fault for fault in found if fault.path not in {known.path for known in faults}]
@@ -109,6 +109,15 @@ def _resolve_scene(raw: dict[str, Any], folder: Path) -> None:
     path = (folder / Path(scene).expanduser()).resolve()
     if "/" in scene or path.suffix or path.exists():  # a built-in scene's name is a bare word
         table["scene"] = str(path)
+
+
+def _resolve_cameras(raw: dict[str, Any], folder: Path) -> None:
+    """Video files are named like scenes; URLs and devices stay."""
+    drones = raw.get("drones")
+    for drone in drones if isinstance(drones, list) else []:
+        camera = drone.get("camera") if isinstance(drone, dict) else None
+        if isinstance(camera, str) and camera and "://" not in camera:
+            drone["camera"] = str((folder / Path(camera).expanduser()).resolve())
 
 
 def _complete_team(raw: dict[str, Any], drones: int | None) -> list[Fault]:

@@ -57,7 +57,7 @@ class Vehicles(Settings):
     """An estimate that moves by so much more between two samples than the vehicle can is a jump: the drone holds."""
     gimbal_lost_s: Positive = 2.0
     """A gimbal that has not been heard or has not obeyed for so long is lost: the drone returns and lands."""
-    gimbal_error_rad: Positive = 0.35
+    gimbal_error_rad: Positive = 0.2
     """What "not obeyed" is."""
     at_end: Literal["return", "land", "hold"] = "return"
     """After the mission: return to the start and land there, land where it is, or stay in the air."""

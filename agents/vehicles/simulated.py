@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
-from agents.vehicles.vehicle import Telemetry
+from agents.vehicles.vehicle import Condition, Telemetry
 from protocol import topics
 from protocol.bus import Bus
 from protocol.geometry import Floats
@@ -13,8 +15,9 @@ from protocol.mission import Flight
 
 
 class SimulatedVehicle:
-    def __init__(self, bus: Bus, drone: int, flight: Flight, tick_s: float) -> None:
-        self._bus, self._drone, self._tick_s = bus, drone, tick_s
+    def __init__(self, bus: Bus, drone: int, flight: Flight, tick_s: float, now_s: Callable[[], float]) -> None:
+        """``now_s``: the clock by which the agent judges silence."""
+        self._bus, self._drone, self._tick_s, self._now_s = bus, drone, tick_s, now_s
         self._limit = np.array(flight.velocity_limits)
         self._telemetry: Telemetry | None = None
         self._tick = 0
@@ -28,7 +31,7 @@ class SimulatedVehicle:
                     np.array(sample.pose),
                     np.array(sample.velocity),
                     sample.battery,
-                    tick.time_s,
+                    self._now_s(),
                     self._delay_s(tick.tick, sample.setpoint_tick),
                 )
                 self._tick = tick.tick
@@ -38,6 +41,15 @@ class SimulatedVehicle:
         if self._first_sent is None:
             return 0.0
         return max(0, tick - 1 - max(flown, self._first_sent - 1)) * self._tick_s
+
+    async def prepare(self) -> None:
+        """Nothing: it hangs in the air at its start."""
+
+    def take_off(self) -> None:
+        """Nothing, likewise."""
+
+    def condition(self) -> Condition:
+        return Condition("ours")
 
     def telemetry(self) -> Telemetry | None:
         return self._telemetry
@@ -53,9 +65,16 @@ class SimulatedVehicle:
     def stop(self) -> None:
         self.send(self._tick, np.zeros(5))
 
+    def hold(self) -> None:
+        self.stop()
+
     def land(self) -> None:
         setpoint = Setpoint(drone=self._drone, tick=self._tick, velocity=(0.0,) * 5, land=True)
         self._bus.put(topics.SETPOINT, setpoint, self._drone)
+
+    def leave(self, *, hold: bool) -> None:  # noqa: ARG002  # either way
+        """Stop: a simulated vehicle falls asleep where it is."""
+        self.stop()
 
     def close(self) -> None:
         """Nothing to release: the bus belongs to the agent."""

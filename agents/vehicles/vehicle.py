@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 from protocol.geometry import Floats
+
+Authority = Literal["ready", "starting", "ours", "yielded", "landing", "landed", "lost"]
+"""Who flies, and how far it is. ready: on the ground, checks passed. starting: arming, taking off, until it obeys.
+ours: it flies what it is sent. yielded: a pilot or a failsafe of its own flies; nothing is sent. landing: it comes down
+by itself, told by us. landed: on the ground after it flew; it will not start again. lost: nothing is heard of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,13 +22,42 @@ class Telemetry:
     battery: float
     """Share left, 0 to 1."""
     stamp_s: float
-    """Mission time at which it was true."""
+    """When it was true, by the clock that the agent judges silence by (`protocol.clock.Clock.now_s`)."""
     delay_s: float = 0.0
     """How much longer than one tick it takes until a command is flown."""
+    rotation: Floats | None = None
+    """(3, 3) camera to world, where the camera tilts with the airframe; None: that of the pose."""
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    authority: Authority
+    reason: str = ""
+    """Why, for people: "pilot switched to POSCTL", "taking off: 1.2 of 1.6 m"."""
+    gimbal_lost: bool = False
+    """The camera no longer points where it is told."""
+    jumps: int = 0
+    """How often the position estimate has jumped so far."""
 
 
 class Vehicle(Protocol):
-    """``stop`` may be called from any thread, the rest from the event loop's. ``close`` may be called twice."""
+    """``stop``, ``hold`` and ``land`` may be called from any thread and never block for longer than a command takes
+    to be acknowledged (some seconds); the rest belongs to the event loop's. ``close`` may be called twice."""
+
+    async def prepare(self) -> None:
+        """Connect, and check until it may take off; or find it in the air, and take over.
+
+        Raises:
+            VehicleError: it was not heard, is somebody else's, or did not pass; every red item is named.
+        """
+        ...
+
+    def take_off(self) -> None:
+        """Climb to the start pose's height, from then on fly what is sent; `condition` tells how far that is.
+        Nothing happens when it flies already."""
+        ...
+
+    def condition(self) -> Condition: ...
 
     def telemetry(self) -> Telemetry | None:
         """None before the first one."""
@@ -37,8 +71,16 @@ class Vehicle(Protocol):
         """Zero velocity now, whatever was sent before."""
         ...
 
+    def hold(self) -> None:
+        """Keep the place by the vehicle's own means, so that nothing need be sent any more."""
+        ...
+
     def land(self) -> None:
         """Come down here and stay on the ground, whatever is sent later; may be called again."""
+        ...
+
+    def leave(self, *, hold: bool) -> None:
+        """The control task ends: what flies for us lands, or holds its place, whatever happens to this process next."""
         ...
 
     def close(self) -> None: ...

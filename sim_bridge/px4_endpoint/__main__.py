@@ -8,6 +8,7 @@ import logging
 import signal
 import sys
 import threading
+import time
 from pathlib import Path
 
 from protocol.errors import MissionError
@@ -18,6 +19,8 @@ from sim_bridge.px4_endpoint.endpoint import Endpoint
 
 WRITE_PERIOD_S = 5.0
 """Between two versions of the truth files, so that a killed process leaves one."""
+LINGER_S = 2.0
+"""Real vehicles do not end with a run: agents that are ended at the same time can still tell theirs to land."""
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +43,8 @@ def fly(endpoint: Endpoint, run: Path, ended: threading.Event) -> int:
             log.info("drone %d is system %d on %s", vehicle.drone.id, vehicle.link.system, vehicle.link.url)
         while endpoint.running and not ended.wait(WRITE_PERIOD_S):
             endpoint.write(run)
+        if ended.is_set():
+            time.sleep(LINGER_S)
     endpoint.write(run)
     return TERMINATED if ended.is_set() else FAILED
 

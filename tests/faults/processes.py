@@ -255,12 +255,13 @@ async def fly(
 
 
 def _commands(mission: Mission, run: Path, endpoint: str, ways: dict[str, str]) -> dict[str, tuple[str, ...]]:
-    """Of each process, with its own way to the router, and the simulator with a witness."""
-    drones = [drone.id for drone in mission.drones]
+    """Of each process, with its own way to the router, and the simulator with a witness where it carries vehicles."""
+    drones, px4 = [drone.id for drone in mission.drones], mission.vehicles.kind == "px4"
+    simulator = "sim_bridge" if px4 else "faults.witness"
     commands = {}
-    for name in [role.name for role in mission_roles(run, endpoint, drones, "1")]:
-        (role,) = (r for r in mission_roles(run, ways.get(name, endpoint), drones, "1") if r.name == name)
-        commands[name] = tuple("faults.witness" if word == "sim_bridge" else word for word in role.command)
+    for name in [role.name for role in mission_roles(run, endpoint, drones, "1", px4=px4)]:
+        (role,) = (r for r in mission_roles(run, ways.get(name, endpoint), drones, "1", px4=px4) if r.name == name)
+        commands[name] = tuple(simulator if word == "sim_bridge" else word for word in role.command)
     return commands
 
 

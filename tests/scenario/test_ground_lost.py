@@ -27,7 +27,7 @@ def mission(ground_lost: str) -> Mission:
 
 
 def modes(team: Team) -> set[str]:
-    return {_agent(team, drone)._mode() for drone in DRONES}
+    return {_agent(team, drone).mode for drone in DRONES}
 
 
 def _agent(team: Team, drone: int) -> Agent:

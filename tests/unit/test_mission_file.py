@@ -259,3 +259,52 @@ def test_the_committed_schema_is_current() -> None:
 
     assert committed == mission_schema(), "covrecon mission schema > protocol/mission.schema.json"
     assert math.isclose(json.loads(committed)["$defs"]["Feedback"]["properties"]["kappa"]["default"], 0.7)
+
+
+@pytest.mark.parametrize(
+    ("named", "kept"),
+    [("front.mp4", None), ("rtsp://10.0.0.2/live", "rtsp://10.0.0.2/live"), ("/dev/video0", "/dev/video0")],
+)
+def test_a_camera_that_is_a_file_is_named_relative_to_the_mission(tmp_path: Path, named: str, kept: str | None) -> None:
+    text = f'[vehicles]\nkind = "px4"\n{ONE_DRONE}camera = "{named}"\n'
+    assert load_mission(write(tmp_path, text)).drones[0].camera == (kept or str(tmp_path / "front.mp4"))
+
+
+def test_a_camera_of_its_own_needs_a_vehicle_of_its_own(tmp_path: Path) -> None:
+    with pytest.raises(MissionError, match="a real camera needs a real vehicle"):
+        load_mission(write(tmp_path, ONE_DRONE + 'camera = "/dev/video0"\n'))
+
+
+def test_two_drones_on_one_port_or_with_one_system_id_are_refused(tmp_path: Path) -> None:
+    text = """
+[vehicles]
+kind = "px4"
+[[drones]]
+id = 1
+start = [0.0, 0.0, 2.0, 0.0, 1.3]
+url = "udpin://127.0.0.1:14541"
+[[drones]]
+id = 2
+start = [2.0, 0.0, 2.0, 0.0, 1.3]
+system_id = 1
+[[drones]]
+id = 3
+start = [2.2, 0.0, 3.5, 0.0, 1.3]
+"""
+    with pytest.raises(MissionError) as refused:
+        load_mission(write(tmp_path, text))
+    said = str(refused.value)
+    assert "udpin://127.0.0.1:14541 is drone 1's already" in said
+    assert "system_id: 1 is drone 1's already" in said
+    assert "0.20 m beside drone 2; to take off and land it takes 1.06 m" in said
+
+
+def test_vehicles_may_be_chosen_on_the_command_line(tmp_path: Path) -> None:
+    chosen = {"kind": "px4", "url": "udpin://127.0.0.1:20000"}
+    mission = load_mission(write(tmp_path, ONE_DRONE), vehicles=chosen, drones=2)
+    assert [mission.vehicle_url(drone) for drone in mission.drones] == [
+        "udpin://127.0.0.1:20000",
+        "udpin://127.0.0.1:20001",
+    ]
+    with pytest.raises(MissionError, match="no connection with a port"):
+        load_mission(write(tmp_path, ONE_DRONE), vehicles={"kind": "px4", "url": "here"})

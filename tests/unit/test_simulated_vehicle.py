@@ -75,7 +75,7 @@ def bus() -> NotingBus:
 
 @pytest.fixture
 def vehicle(bus: NotingBus) -> SimulatedVehicle:
-    return SimulatedVehicle(cast("Bus", bus), 2, FLIGHT, 0.05)
+    return SimulatedVehicle(cast("Bus", bus), 2, FLIGHT, 0.05, lambda: 12.5)
 
 
 def test_there_is_no_telemetry_before_the_first_tick(vehicle: SimulatedVehicle) -> None:
@@ -91,7 +91,7 @@ def test_telemetry_is_the_newest_of_the_own_drone(bus: NotingBus, vehicle: Simul
     assert telemetry is not None
     assert telemetry.pose.tolist() == [2.0, 4.0, 2.0, 0.0, 1.3]
     assert telemetry.velocity.tolist() == [0.2, 0.0, 0.0, 0.0, 0.0]
-    assert (telemetry.battery, telemetry.stamp_s) == (0.5, pytest.approx(0.2))
+    assert (telemetry.battery, telemetry.stamp_s) == (0.5, 12.5)
 
 
 def test_what_is_sent_is_clipped_and_told(bus: NotingBus, vehicle: SimulatedVehicle) -> None:

@@ -111,3 +111,13 @@ def test_a_stranger_that_is_heard_of_becomes_an_obstacle_and_stays_one() -> None
     known.hear(state(3, 8, x=3.0), now=8)
 
     assert [neighbour.drone for neighbour in known.neighbours(100)] == [1, 3, 5]
+
+
+def test_one_that_said_it_has_landed_stays_what_it_is_though_its_process_ended() -> None:
+    known = team()
+    known.hear(state(1, 8, x=3.0).model_copy(update={"mode": "landed"}), now=8)
+    assert known.neighbours(208)[0].age_s == 0.0
+    assert known.neighbours(208, delay_s=0.1)[0].age_s == pytest.approx(0.1)
+
+    known.hear(state(1, 209, x=3.0), now=209)
+    assert known.neighbours(219)[0].age_s == pytest.approx(0.5), "it flies again"
