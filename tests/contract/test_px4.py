@@ -85,7 +85,7 @@ def flight(url: str) -> Iterator[Flight]:
 
 @pytest.fixture
 def vehicle(flight: Flight, backend: str, record_property: Callable[[str, object], None]) -> Client:
-    record_property("backend", backend)
+    record_property("backend", backend if backend == OURS else f"PX4 {backend}")
     return flight.client
 
 
