@@ -11,16 +11,16 @@ import logging
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 
-from agents.barriers import Neighbour
 from agents.cameras.choice import make_feed
 from agents.coverage import CoverageController, Decision
-from agents.homing import down_wish, home_wish
+from agents.homing import Homecoming
 from agents.policies import Order, Policies, Situation, outside_m
 from agents.silence import WitnessedSilence
 from agents.team import Team
@@ -50,10 +50,13 @@ SHARE_PERIOD_S = 1.0
 EARLIER_STATES, PASSED_STATES = 3, 8
 """States repeated in each message: with one message in ten lost, one state in ten thousand is. After ticks that passed
 by without one, more."""
+HOLDS_AFTER_S = 1.5
+"""A vehicle that its agent does not hear stops within this: it is told to, or takes the link for lost (PX4's
+COM_OF_LOSS_T of 1 s, and the way until it stands)."""
+LOST_S = 60.0
+"""After the mission, an agent speaks for a vehicle that is lost until the others are down."""
 LANDED_TICKS = 20
 """How often a drone says that it stands on the ground before its process ends: the others need not wonder."""
-TOUCHDOWN_M = 0.1
-"""Height above the flight region's floor from which the vehicle lands by itself."""
 UNLIMITED = 1e9
 """Margin reported where there is no such row; a finite number, because infinities do not travel."""
 
@@ -84,11 +87,12 @@ class Agent:
         self._replication = Replication(mission, drone)
         self._synchroniser = Synchroniser(bus, self._replication, drone)
         self._planner = CoverageController(mission, neighbours=len(starts) - 1)
+        self._homecoming = Homecoming(mission, drone, self._planner)
         self._clock = clock_of(mission, bus, lockstep=lockstep, now_s=now_s)
         self._vehicle = make_vehicle(mission, drone, bus, now_s=self._clock.now_s, events=self._note_event)
         self._policies = Policies(mission)
         self._order = Order("fly")
-        self._silence = WitnessedSilence()
+        self._silence, self._ground_silence = WitnessedSilence(), WitnessedSilence()
         self._feed = make_feed(mission, drone, bus, now_s=self._clock.now_s)
         self._watchdog = watchdog(
             self._vehicle.stop,
@@ -105,8 +109,9 @@ class Agent:
         self._control: Control | None = None
         self._fallbacks = 0
         self._ground_heard_s = now_s()
-        self._landing = False
         self._landed_told = 0
+        self._blind = False
+        self._finished_s = math.inf
         self._starting_since_s = math.inf
         self._jumps, self._jumped_at_s = 0, -math.inf
         self._finished = ""
@@ -162,6 +167,8 @@ class Agent:
         authority = self._vehicle.condition().authority
         if authority == "landed":
             return self._landed_told >= LANDED_TICKS
+        if authority == "lost":
+            return self._clock.now_s() - self._finished_s > LOST_S
         return authority not in ("starting", "ours", "landing") or self._order == Order(
             "hold", "mission end", self._finished
         )
@@ -182,6 +189,7 @@ class Agent:
         self._ground_heard_s = self._now_s()
         if order.phase == "finished":
             self._finished = order.reason
+            self._finished_s = min(self._finished_s, self._clock.now_s())
             self._bus.recheck()
 
     # --- one tick ------------------------------------------------------------------------------------------------
@@ -196,11 +204,11 @@ class Agent:
         if condition.authority == "ready" and not self._finished and order.action == "wait":
             self._vehicle.take_off()  # the first tick is the order to start
         if telemetry is None or not self._is_sound(telemetry):
-            log.error("tick %d: no sound telemetry: braking", tick.tick)
-            self._vehicle.stop()
-            if order.action == "land":
-                self._vehicle.land()
+            self._step_blindly(telemetry, tick, order)
             return
+        if self._blind:
+            log.info("tick %d: telemetry is sound again", tick.tick)
+            self._blind = False
         self.mode = mode = self._mode(condition, order)
         self._publish(telemetry, tick.tick, mode)
         if self._feed is not None and condition.authority == "ours":
@@ -218,9 +226,22 @@ class Agent:
         decision = self._decide(telemetry, tick, mode, terms)
         solve_s = time.perf_counter() - began
         sent = self._vehicle.send(tick.tick, decision.velocity)
-        if self._landing:
+        if self._homecoming.landing:
             self._vehicle.land()
         self._report(tick.tick, decision, sent, solve_s, age_s)
+
+    def _step_blindly(self, telemetry: Telemetry | None, tick: Tick, order: Order) -> None:
+        """Stop, and say where the vehicle was: the others must not take its silence for flight."""
+        if not self._blind:
+            log.error("tick %d: no sound telemetry: braking", tick.tick)
+            self._blind = True
+        self._vehicle.stop()
+        if order.action == "land":
+            self._vehicle.land()
+        if telemetry is not None and np.isfinite(telemetry.pose).all():
+            blind_s = min(max(0.0, self._clock.now_s() - telemetry.stamp_s), HOLDS_AFTER_S)
+            self.mode, self._control = "yielded", None
+            self._publish(replace(telemetry, velocity=np.zeros(5)), tick.tick, self.mode, blind_s)
 
     def _obey_policies(self, telemetry: Telemetry | None, condition: Condition) -> Order:
         now_s = self._clock.now_s()
@@ -238,7 +259,7 @@ class Agent:
             outside_m=0.0 if telemetry is None else outside_m(self._mission.flight, position),
             jump_age_s=now_s - self._jumped_at_s,
             gimbal_lost=condition.gimbal_lost,
-            ground_away_s=0.0 if self._lockstep else self._now_s() - self._ground_heard_s,
+            ground_away_s=0.0 if self._lockstep else self._ground_silence.look(self._ground_heard_s, self._now_s()),
             finished=self._finished,
         )
         order = self._policies.decide(situation)
@@ -248,8 +269,8 @@ class Agent:
         self._order = order
         return order
 
-    def _publish(self, telemetry: Telemetry, tick: int, mode: Mode) -> None:
-        state = self._state_of(telemetry, tick, mode)
+    def _publish(self, telemetry: Telemetry, tick: int, mode: Mode, blind_s: float = 0.0) -> None:
+        state = self._state_of(telemetry, tick, mode, blind_s)
         self._replication.hear_state(state)
         self._bus.put(topics.STATE, state, self._drone)
         self._published = tick
@@ -269,26 +290,18 @@ class Agent:
 
     def _decide(self, telemetry: Telemetry, tick: Tick, mode: Mode, terms: SamplingTerms) -> Decision:
         neighbours = self._team.neighbours(tick.tick, telemetry.delay_s)
+        if mode in ("returning", "landing"):
+            return self._homecoming.steer(
+                telemetry.pose, telemetry.velocity, neighbours, home=mode == "returning", now_s=self._clock.now_s()
+            )
+        self._homecoming.put_off()
         if mode in ("joining", "holding"):
             return self._planner.steer(telemetry.pose, telemetry.velocity, neighbours)
-        if mode in ("returning", "landing"):
-            return self._bring_down(telemetry, neighbours, mode)
         if tick.time_s - self._cells_at >= SHARE_PERIOD_S:
             row, poses = self._replication.newest()
             self._cells = float(self._replication.replica.field.owned_cells(poses)[row])
             self._cells_at = tick.time_s
         return self._planner.decide(telemetry.pose, telemetry.velocity, neighbours, terms, self._cells)
-
-    def _bring_down(self, telemetry: Telemetry, neighbours: Sequence[Neighbour], mode: Mode) -> Decision:
-        flight, pose = self._mission.flight, telemetry.pose
-        low = pose[2] - flight.lower_m[2] < TOUCHDOWN_M
-        distance, speed = flight.estimated_separation_m, flight.speed_max_mps
-        wish = down_wish(pose, neighbours, distance, speed)
-        if mode == "returning":
-            home = self._mission.drone(self._drone).start
-            wish = home_wish(pose, home, neighbours, distance, speed)
-        self._landing = self._landing or bool(low and wish[2] < 0)
-        return self._planner.steer(pose, telemetry.velocity, neighbours, wish)
 
     def _mode(self, condition: Condition, order: Order) -> Mode:
         by_authority: dict[str, Mode] = {
@@ -301,7 +314,7 @@ class Agent:
         }
         if condition.authority in by_authority:
             return by_authority[condition.authority]
-        if self._landing:
+        if self._homecoming.landing:
             return "landing"
         by_order: dict[str, Mode] = {"hold": "holding", "return": "returning", "land": "landing"}
         if order.action in by_order:
@@ -315,7 +328,7 @@ class Agent:
         fresh = self._clock.now_s() - telemetry.stamp_s <= self._mission.vehicles.telemetry_stale_s
         return fresh and bool(np.isfinite(telemetry.pose).all() and np.isfinite(telemetry.velocity).all())
 
-    def _state_of(self, telemetry: Telemetry, tick: int, mode: Mode) -> DroneState:
+    def _state_of(self, telemetry: Telemetry, tick: int, mode: Mode, blind_s: float) -> DroneState:
         return DroneState(
             drone=self._drone,
             tick=tick,
@@ -323,6 +336,7 @@ class Agent:
             velocity=tuple(telemetry.velocity.tolist()),
             battery=telemetry.battery,
             mode=mode,
+            blind_s=blind_s,
             earlier=tuple(
                 entry for entry in self._earlier if entry[0] > min(self._published, tick - 1 - EARLIER_STATES)
             ),

@@ -105,13 +105,24 @@ class CoverageController:
         self.decide(np.zeros(5), np.zeros(5), [neighbour], SamplingTerms(np.ones(5), 1.0, 1.0), 1.0)
 
     def brake(self, rows: Rows, low: Floats, high: Floats) -> Floats:
-        """Stop; or, when neighbours are already too near, move away from the nearest unless another row forbids it."""
+        """Stop; or, where strict rows are broken already, undo that as fast as the vehicle can, unless another row
+        forbids it: away from the nearest neighbour first, else back into the region and the gimbal's range."""
         separation = rows.barriers[FIXED_ROWS:]
         if separation.size and separation.min() < 0:
             offset = rows.coefficients[FIXED_ROWS + int(separation.argmin())]
             distance = float(np.linalg.norm(offset))
             if distance > 0:  # else every direction is as good as any
                 retreat: Floats = np.clip(offset / distance * top_speed(self._mission.flight), low, high)
-                if (rows.coefficients @ retreat >= np.minimum(rows.bounds, 0.0)).all():
+                if _worsens_nothing(rows, retreat):
                     return retreat
-        return np.zeros(5)
+        inwards: Floats = np.zeros(5)
+        for k in np.flatnonzero(rows.barriers[:FIXED_ROWS] < 0):
+            axis = int(np.abs(rows.coefficients[k]).argmax())  # each of these rows is about one
+            inwards[axis] = rows.bounds[k] / rows.coefficients[k, axis]
+        inwards = np.clip(inwards, low, high)
+        return inwards if _worsens_nothing(rows, inwards) else np.zeros(5)
+
+
+def _worsens_nothing(rows: Rows, velocity: Floats) -> bool:
+    """Whether ``velocity`` (5,) meets every row that can be met, and takes no broken one further."""
+    return bool((rows.coefficients @ velocity >= np.minimum(rows.bounds, 0.0)).all())

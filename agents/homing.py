@@ -1,4 +1,4 @@
-"""Where a drone wants to go when it no longer covers: home, and down. Wishes only: the strict rows decide.
+"""Home, and down: where a drone wants to go when it no longer covers. Wishes only: the strict rows decide.
 
 Two rules keep wishes from ending in a stalemate, which strict rows alone would hold for ever: who meets somebody on the
 way keeps to the right, and nobody comes down above another.
@@ -6,13 +6,16 @@ way keeps to the right, and nobody comes down above another.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from agents.barriers import Neighbour
+from agents.coverage import Decision, Planner
 from protocol.geometry import Floats
+from protocol.mission import Mission
 
 ARRIVED_M = 0.2
 """Horizontal distance from home at which it is reached."""
@@ -21,6 +24,52 @@ ROOM = 1.5
 """Horizontal distance, in separations, within which somebody is in the way."""
 APPROACH_PER_S = 0.8
 """Wished speed for each metre that is left."""
+TOUCHDOWN_M = 0.1
+"""Height above the flight region's floor from which the vehicle lands by itself."""
+STUCK_S = 10.0
+"""Who has come no nearer to home, or to the ground, for so long lands by the vehicle's own means where nobody is below:
+it cannot hover for ever. Others may stand where its home is, or be silent and so seem to be everywhere."""
+NEARER_M = 0.05
+"""Less is no progress."""
+
+log = logging.getLogger(__name__)
+
+
+class Homecoming:
+    """Brings one drone down, at home or where it is, and notices when there is no way."""
+
+    def __init__(self, mission: Mission, drone: int, planner: Planner) -> None:
+        self._flight, self._home, self._planner = mission.flight, mission.drone(drone).start, planner
+        self._left_m = math.inf
+        """Way to go, the least so far ..."""
+        self._nearer_s = 0.0
+        """... and since when."""
+        self.landing = False
+        """Whether the vehicle is to land by itself now; it is never taken back."""
+
+    def steer(
+        self, pose: Floats, velocity: Floats, neighbours: Sequence[Neighbour], *, home: bool, now_s: float
+    ) -> Decision:
+        """``pose`` and ``velocity`` (5,); ``home``: at the start's place instead of here."""
+        distance, speed = self._flight.estimated_separation_m, self._flight.speed_max_mps
+        if home:
+            wish = home_wish(pose, self._home, neighbours, distance, speed)
+        else:
+            wish = down_wish(pose, neighbours, distance, speed)
+        decision = self._planner.steer(pose, velocity, neighbours, wish)
+        height = float(pose[2]) - self._flight.lower_m[2]
+        self.landing = self.landing or bool(height < TOUCHDOWN_M and wish[2] < 0)
+        left_m = height + (math.dist(pose[:2], self._home[:2]) if home else 0.0)
+        if left_m < self._left_m - NEARER_M:
+            self._left_m, self._nearer_s = left_m, now_s
+        elif now_s - self._nearer_s > STUCK_S and not self.landing and not _below(pose, neighbours, distance):
+            log.warning("no way %s for %g s: landing here", "home" if home else "down", STUCK_S)
+            self.landing = True
+        return decision
+
+    def put_off(self) -> None:
+        """It does something else now."""
+        self._left_m = math.inf
 
 
 def home_wish(
@@ -42,13 +91,12 @@ def home_wish(
 def down_wish(pose: Floats, neighbours: Sequence[Neighbour], separation_m: float, speed_mps: float) -> Floats:
     """Velocity (5,) straight down; sideways instead while somebody is below or near it."""
     away = np.zeros(2)
-    for neighbour in neighbours:
+    for neighbour in _below(pose, neighbours, separation_m):
         offset = pose[:2] - neighbour.position[:2]
         distance = float(np.linalg.norm(offset))
-        if distance < separation_m and neighbour.position[2] < pose[2]:
-            # Exactly above each other every direction is as good; the number makes two of them choose different ones.
-            direction = offset / distance if distance > 1e-6 else _direction(neighbour.drone)
-            away += direction * (1 - distance / separation_m + 0.2)
+        # Exactly above each other every direction is as good; the number makes two of them choose different ones.
+        direction = offset / distance if distance > 1e-6 else _direction(neighbour.drone)
+        away += direction * (1 - distance / separation_m + 0.2)
     wish = np.zeros(5)
     strength = float(np.linalg.norm(away))
     if strength > 0:
@@ -56,6 +104,15 @@ def down_wish(pose: Floats, neighbours: Sequence[Neighbour], separation_m: float
     else:
         wish[2] = -min(DESCENT_MPS, speed_mps)
     return wish
+
+
+def _below(pose: Floats, neighbours: Sequence[Neighbour], separation_m: float) -> list[Neighbour]:
+    """Those on whom it would come down."""
+    return [
+        neighbour
+        for neighbour in neighbours
+        if neighbour.position[2] < pose[2] and math.dist(neighbour.position[:2], pose[:2]) < separation_m
+    ]
 
 
 def _meets(pose: Floats, heading: Floats, neighbours: Sequence[Neighbour], separation_m: float) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,37 +12,46 @@ from protocol.messages import DroneState
 from protocol.mission import Flight
 
 
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    tick: int
+    pose: Sequence[float]
+    velocity: Sequence[float]
+    blind_s: float = 0.0
+    landed: bool = False
+    """Then it stays where it is, also when its process has ended."""
+
+
 class Team:
     """``starts`` are poses of the whole team, so that a drone that never speaks is an obstacle at its start."""
 
     def __init__(self, own: int, starts: Mapping[int, Sequence[float]], flight: Flight, tick_s: float) -> None:
         self._own, self._flight, self._tick_s = own, flight, tick_s
-        self._last_seen: dict[int, tuple[int, Sequence[float], Sequence[float]]] = {
-            drone: (0, start, (0.0,) * 5) for drone, start in starts.items() if drone != own
-        }
-        self._landed: set[int] = set()
-        """Those that said so last: they stay where they are, also when their process has ended."""
+        self._last_seen = {drone: _Seen(0, start, (0.0,) * 5) for drone, start in starts.items() if drone != own}
 
     def hear(self, state: DroneState, now: int) -> None:
         """``now``: this drone's own newest tick. An older state never replaces a newer one, and none is younger than
         its arrival, give or take the tick that its sender may have heard first: a clock that is ahead must not hide
         that its drone fell silent."""
         known = self._last_seen.get(state.drone)
-        if state.drone != self._own and (known is None or known[0] <= state.tick):
-            self._last_seen[state.drone] = (min(state.tick, now + 1), state.pose, state.velocity)
-            (self._landed.add if state.mode == "landed" else self._landed.discard)(state.drone)
+        if state.drone != self._own and (known is None or known.tick <= state.tick):
+            tick = min(state.tick, now + 1)
+            self._last_seen[state.drone] = _Seen(
+                tick, state.pose, state.velocity, state.blind_s, state.mode == "landed"
+            )
 
     def neighbours(self, tick: int, delay_s: float = 0.0) -> list[Neighbour]:
         """All the others at ``tick``, ascending by id; the longer silent, the larger, and the longer ``delay_s``, the
         time until a command is flown: until then either may move on."""
         others = sorted(self._last_seen.items())
-        poses = np.array([pose for _, (_, pose, _) in others]).reshape(-1, 5)
-        velocities = np.array([velocity for _, (_, _, velocity) in others]).reshape(-1, 5)
+        poses = np.array([seen.pose for _, seen in others]).reshape(-1, 5)
+        velocities = np.array([seen.velocity for _, seen in others]).reshape(-1, 5)
         predicted = predicted_pose(poses, velocities, self._flight)
         return [
-            Neighbour(drone, predicted[row, :3], self._silence_s(drone, tick - seen) + delay_s)
-            for row, (drone, (seen, _, _)) in enumerate(others)
+            Neighbour(drone, predicted[row, :3], self._silence_s(seen, tick) + delay_s)
+            for row, (drone, seen) in enumerate(others)
         ]
 
-    def _silence_s(self, drone: int, ticks: int) -> float:
-        return 0.0 if drone in self._landed else max(0, ticks) * self._tick_s
+    def _silence_s(self, seen: _Seen, tick: int) -> float:
+        """In which it may have moved without a word."""
+        return 0.0 if seen.landed else max(0, tick - seen.tick) * self._tick_s + seen.blind_s

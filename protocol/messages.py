@@ -122,6 +122,9 @@ class DroneState(Message):
     velocity: Vector5
     battery: Annotated[float, Field(ge=0, le=1)]
     mode: Mode
+    blind_s: Annotated[float, Field(ge=0, le=60)] = 0.0
+    """How long the vehicle may have flown on since ``pose`` was true: its agent does not hear it, and it stops by
+    itself."""
     earlier: Annotated[tuple[tuple[TickNumber, Vector5], ...], Field(max_length=8)] = ()
     """Ticks and poses of the states just before, repeated so that a lost message loses nothing."""
     importance: Finite

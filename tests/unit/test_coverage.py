@@ -235,3 +235,28 @@ def test_a_wished_descent_is_flown_as_far_as_the_strict_rows_allow() -> None:
     assert free.velocity[2] == pytest.approx(-0.3, rel=0.01)
     assert np.abs(free.velocity[:2]).max() < 0.01
     assert blocked.velocity[2] > -0.15
+
+
+def test_a_drone_far_outside_its_region_comes_back_as_fast_as_it_can() -> None:
+    pose = np.array([4.9, 0.0, 0.1, 0.7, 1.25])  # flight region: x to 4, z from 0.5
+    decision = CoverageController(MISSION, neighbours=1).steer(pose, STILL, [])
+
+    assert decision.outcome == "infeasible", "the row wants more than the vehicle can"
+    assert decision.velocity == pytest.approx([-0.5, 0.0, 0.4, 0.0, 0.0], abs=1e-6)
+
+
+def test_a_camera_outside_its_range_turns_back() -> None:
+    decision = CoverageController(MISSION, neighbours=1).steer(np.array([0.0, 0.0, 2.0, 0.0, 0.2]), STILL, [])
+
+    assert decision.outcome == "infeasible"
+    assert decision.velocity == pytest.approx([0.0, 0.0, 0.0, 0.0, 0.5])
+
+
+def test_nobody_comes_back_through_a_neighbour() -> None:
+    pose = np.array([4.9, 0.0, 2.0, 0.7, 1.25])
+    decision = CoverageController(MISSION, neighbours=1).steer(
+        pose, STILL, [Neighbour(2, pose[:3] - [1.28, 0.0, 0.0], 0.0)]
+    )
+
+    assert decision.outcome == "infeasible"
+    assert np.abs(decision.velocity).max() == 0

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from agents.barriers import Neighbour, predicted_pose
 from agents.coverage import CoverageController
-from agents.homing import ARRIVED_M, down_wish, home_wish
+from agents.homing import ARRIVED_M, STUCK_S, Homecoming, down_wish, home_wish
 from protocol.geometry import Floats
 from protocol.mission import Drone, Flight, Mission
 
@@ -92,3 +92,48 @@ def test_nobody_lands_on_whom_he_hovers_above(offset: float) -> None:
     team = Team([(0.0, 0.0), (1.5, 0.0)], [np.array([0.0, 0.0, 1.0]), np.array([offset, 0.0, 2.6])])
     team.fly(home=False)
     assert team.nearest >= FLIGHT.separation_m
+
+
+STARTS = tuple(Drone(id=k + 1, start=(3.0 * k, 0.0, 2.0, 0.0, 1.3)) for k in range(2))
+
+
+def stuck(at: Floats, others: list[Neighbour], *, home: bool = True) -> list[float]:
+    """Moments at which a drone that never moves is told to land, asked every second of a minute."""
+    mission = Mission(drones=STARTS, flight=FLIGHT)
+    homecoming = Homecoming(mission, 1, CoverageController(mission, neighbours=1))
+    moments = []
+    for second in range(60):
+        homecoming.steer(at, np.zeros(5), others, home=home, now_s=float(second))
+        moments += [float(second)] if homecoming.landing else []
+    return moments
+
+
+@pytest.mark.parametrize("home", [True, False])
+def test_who_comes_no_nearer_for_long_lands_where_it_is(*, home: bool) -> None:
+    at = np.array([2.0, 0.0, 2.0, 0.0, 1.3])
+    assert stuck(at, [], home=home)[0] == STUCK_S + 1
+    silent = Neighbour(2, np.array([3.2, 0.0, 1.0]), age_s=900.0)
+    assert stuck(at, [silent], home=home)[0] == STUCK_S + 1, "also when no way is found"
+
+
+def test_nobody_lands_on_another_because_it_is_stuck() -> None:
+    at = np.array([2.0, 0.0, 2.0, 0.0, 1.3])
+    assert stuck(at, [Neighbour(2, np.array([2.5, 0.0, 0.0]), age_s=0.0)]) == []
+
+
+def test_progress_or_another_task_in_between_starts_the_time_anew() -> None:
+    mission = Mission(drones=STARTS, flight=FLIGHT)
+    homecoming = Homecoming(mission, 1, CoverageController(mission, neighbours=1))
+
+    def steer(x: float, now_s: float) -> bool:
+        homecoming.steer(np.array([x, 0.0, 2.0, 0.0, 1.3]), np.zeros(5), [], home=True, now_s=now_s)
+        return homecoming.landing
+
+    assert not steer(2.0, 0.0)
+    assert not steer(2.0, STUCK_S)
+    assert not steer(1.9, STUCK_S + 1)
+    assert not steer(1.9, 2 * STUCK_S)
+    homecoming.put_off()
+    assert not steer(1.9, 3 * STUCK_S)
+    assert steer(1.9, 4 * STUCK_S + 0.1)
+    assert steer(0.1, 5 * STUCK_S), "never taken back"

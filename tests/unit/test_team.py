@@ -121,3 +121,10 @@ def test_one_that_said_it_has_landed_stays_what_it_is_though_its_process_ended()
 
     known.hear(state(1, 209, x=3.0), now=209)
     assert known.neighbours(219)[0].age_s == pytest.approx(0.5), "it flies again"
+
+
+def test_one_whose_agent_is_blind_grows_by_what_it_may_have_flown_and_no_further() -> None:
+    known = team()
+    for tick in (8, 48, 88):
+        known.hear(state(1, tick, x=3.0).model_copy(update={"mode": "yielded", "blind_s": 1.5}), now=tick)
+        assert known.neighbours(tick)[0].age_s == pytest.approx(1.5)

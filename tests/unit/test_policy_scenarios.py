@@ -1,0 +1,49 @@
+"""Every row of the policies' table has a flight that shows it."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from agents.policies import policy_table
+
+SCENARIOS = Path("tests/scenario/test_px4_failures.py")
+
+BATTERIES = "test_batteries_a_gimbal_and_a_pilot"
+TELEMETRY = "test_telemetry_an_estimate_a_fence_and_a_refusal"
+PROCESSES = "test_an_agent_stopped_one_killed_and_the_ground_station_lost"
+CUT = "test_the_others_fly_on_and_land_when_a_link_is_cut_for_good"
+
+SHOWN_BY = {
+    "take-over": BATTERIES,
+    "landing": BATTERIES,
+    "telemetry lost": CUT,
+    "battery critical": BATTERIES,
+    "geofence": TELEMETRY,
+    "mission end": PROCESSES,
+    "battery low": BATTERIES,
+    "gimbal lost": BATTERIES,
+    "ground station lost": PROCESSES,
+    "telemetry stale": TELEMETRY,
+    "estimate jumped": TELEMETRY,
+    "not ours yet": TELEMETRY,
+}
+
+
+@pytest.fixture
+def scenarios(root_path: Path) -> dict[str, str]:
+    """Docstrings by the names of the tests."""
+    module = ast.parse((root_path / SCENARIOS).read_text())
+    tests = [node for node in module.body if isinstance(node, ast.AsyncFunctionDef) and node.name.startswith("test_")]
+    return {test.name: ast.get_docstring(test) or "" for test in tests}
+
+
+def test_every_row_is_shown_by_a_scenario() -> None:
+    assert set(SHOWN_BY) == {row[0] for row in policy_table()}
+
+
+@pytest.mark.parametrize("row", SHOWN_BY)
+def test_a_scenario_exists_and_names_its_row(row: str, scenarios: dict[str, str]) -> None:
+    assert row in scenarios[SHOWN_BY[row]]
