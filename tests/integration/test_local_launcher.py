@@ -191,10 +191,11 @@ DIES_FIRST = (
 
 
 def test_who_dies_is_started_again_and_then_counts_as_one_that_never_died(run: Path) -> None:
+    waits = "import time\nwhile not (mark.parent / 'flies').exists(): time.sleep(0.01)\n"  # its end is the run's
     code, said = supervised(
         run,
-        role("ground", "ground", DIES_FIRST.format(name="ground", deaths=2)),
-        role("drone-1", "agent", DIES_FIRST.format(name="drone-1", deaths=1)),
+        role("ground", "ground", DIES_FIRST.format(name="ground", deaths=2) + waits),
+        role("drone-1", "agent", DIES_FIRST.format(name="drone-1", deaths=1) + "(mark.parent / 'flies').touch()\n"),
         restarts=3,
     )
 
