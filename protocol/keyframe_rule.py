@@ -1,4 +1,4 @@
-"""When a camera has moved enough for another keyframe: the rule by which cameras save bandwidth."""
+"""When a camera has moved enough for another keyframe, the rule by which cameras save bandwidth; and what one is."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from protocol.geometry import Floats
+from protocol.geometry import Floats, Intrinsics
+from protocol.messages import Keyframe
 from protocol.mission import Camera
 
 
@@ -27,3 +28,24 @@ class KeyframeRule:
                 return False
         self._last = (position.copy(), rotation.copy())
         return True
+
+
+def make_keyframe(
+    drone: int, sequence: int, tick: int, position: Floats, rotation: Floats, intrinsics: Intrinsics, jpeg: bytes
+) -> Keyframe:
+    """``position`` (3,) and ``rotation`` (3, 3), camera to world, are those of the camera."""
+    x_row, y_row, z_row = rotation.tolist()
+    return Keyframe(
+        drone=drone,
+        sequence=sequence,
+        tick=tick,
+        position=tuple(position.tolist()),
+        rotation=(tuple(x_row), tuple(y_row), tuple(z_row)),
+        width=intrinsics.width,
+        height=intrinsics.height,
+        fx=intrinsics.fx,
+        fy=intrinsics.fy,
+        cx=intrinsics.cx,
+        cy=intrinsics.cy,
+        jpeg=jpeg,
+    )

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from protocol.geometry import Floats, camera_rotation
-from protocol.keyframe_rule import KeyframeRule
+from protocol.keyframe_rule import KeyframeRule, make_keyframe
 from protocol.messages import Keyframe
 from protocol.mission import Mission
 from sim_bridge.camera import Camera, add_noise
@@ -51,19 +51,13 @@ class Photographer:
             image = add_noise(image, self._mission.simulation.image_noise, generator)
         jpeg = io.BytesIO()
         Image.fromarray(image).save(jpeg, "JPEG", quality=settings.jpeg_quality)
-        x_row, y_row, z_row = camera_rotation(shot.pose[3], shot.pose[4]).tolist()
-        intrinsics = self._intrinsics
-        return Keyframe(
-            drone=shot.drone,
-            sequence=shot.sequence,
-            tick=shot.tick,
-            position=tuple(shot.pose[:3].tolist()),
-            rotation=(tuple(x_row), tuple(y_row), tuple(z_row)),
-            width=intrinsics.width,
-            height=intrinsics.height,
-            fx=intrinsics.fx,
-            fy=intrinsics.fy,
-            cx=intrinsics.cx,
-            cy=intrinsics.cy,
-            jpeg=jpeg.getvalue(),
+        pose = shot.pose
+        return make_keyframe(
+            shot.drone,
+            shot.sequence,
+            shot.tick,
+            pose[:3],
+            camera_rotation(pose[3], pose[4]),
+            self._intrinsics,
+            jpeg.getvalue(),
         )

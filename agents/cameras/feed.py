@@ -19,7 +19,7 @@ from agents.cameras.opencv import load_opencv
 from agents.cameras.pose_history import Moment, PoseHistory
 from protocol.errors import CovreconError, VehicleError
 from protocol.geometry import Floats
-from protocol.keyframe_rule import KeyframeRule
+from protocol.keyframe_rule import KeyframeRule, make_keyframe
 from protocol.messages import Keyframe
 from protocol.mission import Mission
 
@@ -137,21 +137,14 @@ class CameraFeed:
             )
 
     def _keyframe(self, image: NDArray[np.uint8], moment: Moment) -> Keyframe:
-        intrinsics = self._intrinsics
-        x_row, y_row, z_row = moment.rotation.tolist()
-        return Keyframe(
-            drone=self._drone,
-            sequence=self.published,
-            tick=moment.tick,
-            position=tuple(moment.pose[:3].tolist()),
-            rotation=(tuple(x_row), tuple(y_row), tuple(z_row)),
-            width=intrinsics.width,
-            height=intrinsics.height,
-            fx=intrinsics.fx,
-            fy=intrinsics.fy,
-            cx=intrinsics.cx,
-            cy=intrinsics.cy,
-            jpeg=self._jpeg(image),
+        return make_keyframe(
+            self._drone,
+            self.published,
+            moment.tick,
+            moment.pose[:3],
+            moment.rotation,
+            self._intrinsics,
+            self._jpeg(image),
         )
 
     def _jpeg(self, image: NDArray[np.uint8]) -> bytes:
