@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import socket
 from collections.abc import AsyncIterator, Callable, Mapping
@@ -212,12 +213,16 @@ class Px4Flight:
         """End the mission, in the ground station's place."""
         self.bus.put(topics.PHASE, MissionPhase(phase="finished", reason=reason))
 
-    def judge(self, outside_m: Mapping[int, float]) -> None:
+    def judge(self, outside_m: Mapping[int, float], astray_m: Mapping[int, float] | None = None) -> None:
         """Nobody came too near to another, and nobody left the flight region by more than the fence's margin, or what
-        ``outside_m`` grants a drone for what was done to it. All of it is the truth, not what drones believe."""
-        mission = self.processes.mission
-        assert self.autopilots.truth.separation_m >= mission.flight.separation_m
+        ``outside_m`` grants a drone for what was done to it. All of it is the truth, not what drones believe: where an
+        estimate was put off by ``astray_m``, beyond the mission's ``position_error_m``, no row can keep the truth."""
+        mission, off = self.processes.mission, astray_m or {}
         _, poses = self.autopilots.truth.poses()
+        for (i, one), (j, other) in itertools.combinations(enumerate(self.drones), 2):
+            nearest = float(np.linalg.norm(poses[:, i, :3] - poses[:, j, :3], axis=1).min())
+            kept = mission.flight.separation_m - off.get(one, 0.0) - off.get(other, 0.0)
+            assert nearest >= kept, f"drones {one} and {other}"
         low, high = np.array(mission.flight.lower_m), np.array(mission.flight.upper_m)
         low[2] = 0.0  # the ground, where they start and land
         for index, drone in enumerate(self.drones):

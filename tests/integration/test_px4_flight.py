@@ -68,7 +68,11 @@ def fly(tmp_path: Path) -> Iterator[Fly]:
         url = f"udpin://127.0.0.1:{free_ports(2)}"
         command = [COVRECON, "run", path, "--headless", "--vehicles", "px4-endpoint", "--px4-url", url, *options]
         run = subprocess.Popen(
-            [*command, "--out", tmp_path / "runs"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+            [*command, "--out", tmp_path / "runs"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env=os.environ | {"TMPDIR": str(tmp_path)},  # where ports and systems are locked: others fly as well
         )
         started.append(run)
         return run
