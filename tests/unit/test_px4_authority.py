@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from agents.vehicles.px4.authority import GAP_MEMORY_S, RETRY_S, STICKS, AuthorityLogic
+from agents.vehicles.px4.authority import GAP_MEMORY_S, RETRY_S, STICKS, AuthorityLogic, Observation
 from faults.scripted_px4 import AIR, Flight, in_our_hands, on_ground
 
 
@@ -189,3 +189,28 @@ def test_a_loss_action_that_looks_like_a_pilot_is_taken_for_one() -> None:
     flight.see(mode="HOLD")
 
     assert flight.authority == "yielded"
+
+
+def test_old_news_of_the_mode_before_the_take_off_does_not_end_it() -> None:
+    logic = AuthorityLogic(start_m=1.5, lost_after_s=3.0)
+
+    def seen(mode: str, height_m: float, *, now_s: float, on_ground: bool = False) -> None:
+        logic.observe(
+            Observation(
+                mode=mode,
+                mode_at_s=now_s,
+                armed=True,
+                on_ground=on_ground,
+                height_m=height_m,
+                heard_s=now_s,
+            ),
+            now_s,
+        )
+
+    seen("HOLD", 0.0, now_s=0.0, on_ground=True)
+    logic.take_off(0.1)
+    seen("HOLD", 0.2, now_s=0.2)
+    assert logic.phase == "climbing", "it has left the ground before a heartbeat told of TAKEOFF"
+    seen("TAKEOFF", 0.4, now_s=1.2)
+    seen("HOLD", 1.3, now_s=2.2)
+    assert logic.phase == "entering"

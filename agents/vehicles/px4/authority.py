@@ -27,6 +27,8 @@ GAP_MEMORY_S = 5.0
 """How long ago that may be when a mode change shows: the failsafe's own delays, a heartbeat, a blocked machine."""
 STREAM_S = 0.5
 """How long setpoints must have been streaming before OFFBOARD is asked for."""
+CLIMB_SHORT_M = 0.5
+"""A take-off that ended so far below its height was one, though none was told: it took less than a heartbeat."""
 DISARM_S = 6.0
 """An autopilot that stands on the ground disarms by itself (COM_DISARM_LAND, 2 s); after so long it is told to."""
 
@@ -78,6 +80,8 @@ class AuthorityLogic:
         self._silence = WitnessedSilence()
         self._land_ordered = False
         self._landing_seen = False
+        self._climb_seen = False
+        """Whether the mode has been TAKEOFF: before, another one is only old news."""
         self._flew = False
         self._entered_s = -math.inf
         self._answered_s = -math.inf
@@ -176,7 +180,9 @@ class AuthorityLogic:
     def _climb(self, seen: Observation, changed: bool, now_s: float) -> Step:
         if changed and seen.mode not in CAUTIOUS:
             return self._yield_to(seen, now_s)
-        if not seen.on_ground and seen.mode != "TAKEOFF":
+        self._climb_seen = self._climb_seen or seen.mode == "TAKEOFF"
+        has_climbed = self._climb_seen or seen.height_m > self._start_m - CLIMB_SHORT_M
+        if not seen.on_ground and seen.mode != "TAKEOFF" and has_climbed:
             self._enter("entering", now_s, "took off")
             return "wait"
         if not seen.armed:
