@@ -21,8 +21,8 @@ import numpy as np
 from agents.cameras.choice import make_feed
 from agents.coverage import CoverageController, Decision
 from agents.homing import Homecoming
-from agents.policies import Order, Policies, Situation, outside_m
-from agents.silence import WitnessedSilence
+from agents.orders import Orders
+from agents.policies import Order
 from agents.team import Team
 from agents.vehicles.choice import make_vehicle
 from agents.vehicles.vehicle import Condition, Telemetry
@@ -90,9 +90,7 @@ class Agent:
         self._homecoming = Homecoming(mission, drone, self._planner)
         self._clock = clock_of(mission, bus, lockstep=lockstep, now_s=now_s)
         self._vehicle = make_vehicle(mission, drone, bus, now_s=self._clock.now_s, events=self._note_event)
-        self._policies = Policies(mission)
-        self._order = Order("fly")
-        self._silence, self._ground_silence = WitnessedSilence(), WitnessedSilence()
+        self._orders = Orders(mission, self._clock.now_s)
         self._feed = make_feed(mission, drone, bus, now_s=self._clock.now_s)
         self._watchdog = watchdog(
             self._vehicle.stop,
@@ -112,8 +110,6 @@ class Agent:
         self._landed_told = 0
         self._blind = False
         self._finished_s = math.inf
-        self._starting_since_s = math.inf
-        self._jumps, self._jumped_at_s = 0, -math.inf
         self._finished = ""
         self.mode: Mode = "starting"
         """As its newest state says."""
@@ -143,7 +139,7 @@ class Agent:
                     try:
                         await self._follow_clock()
                     finally:
-                        self._vehicle.leave(hold=self._order.action == "hold" and bool(self._finished))
+                        self._vehicle.leave(hold=self._orders.stays_up)
         finally:
             if self._feed is not None:
                 await asyncio.to_thread(self._feed.close)
@@ -169,9 +165,7 @@ class Agent:
             return self._landed_told >= LANDED_TICKS
         if authority == "lost":
             return self._clock.now_s() - self._finished_s > LOST_S
-        return authority not in ("starting", "ours", "landing") or self._order == Order(
-            "hold", "mission end", self._finished
-        )
+        return authority not in ("starting", "ours", "landing") or self._orders.stays_up
 
     def _note_event(self, level: str, text: str) -> None:
         log.log(logging.getLevelNamesMapping().get(level.upper(), logging.INFO), "vehicle: %s", text)
@@ -200,7 +194,7 @@ class Agent:
             self._earlier.extend((tick.tick, own.pose) for own in tick.vehicles if own.drone == self._drone)
             return
         telemetry, condition = self._vehicle.telemetry(), self._vehicle.condition()
-        order = self._obey_policies(telemetry, condition)
+        order = self._give_orders(telemetry, condition)
         if condition.authority == "ready" and not self._finished and order.action == "wait":
             self._vehicle.take_off()  # the first tick is the order to start
         if telemetry is None or not self._is_sound(telemetry):
@@ -214,8 +208,9 @@ class Agent:
         if self._feed is not None and condition.authority == "ours":
             self._feed.note_pose(telemetry.stamp_s, tick.tick, telemetry.pose, telemetry.rotation)
         terms = await self._advance(tick)
-        self._watchdog.feed()
         if condition.authority != "ours":
+            self._watchdog.feed()  # nothing is to be sent
+            self._homecoming.put_off()
             self._control = None
             if order.action == "land" and condition.authority == "starting":
                 self._vehicle.land()
@@ -226,6 +221,7 @@ class Agent:
         decision = self._decide(telemetry, tick, mode, terms)
         solve_s = time.perf_counter() - began
         sent = self._vehicle.send(tick.tick, decision.velocity)
+        self._watchdog.feed()
         if self._homecoming.landing:
             self._vehicle.land()
         self._report(tick.tick, decision, sent, solve_s, age_s)
@@ -235,6 +231,7 @@ class Agent:
         if not self._blind:
             log.error("tick %d: no sound telemetry: braking", tick.tick)
             self._blind = True
+        self._homecoming.put_off()
         self._vehicle.stop()
         if order.action == "land":
             self._vehicle.land()
@@ -243,31 +240,9 @@ class Agent:
             self.mode, self._control = "yielded", None
             self._publish(replace(telemetry, velocity=np.zeros(5)), tick.tick, self.mode, blind_s)
 
-    def _obey_policies(self, telemetry: Telemetry | None, condition: Condition) -> Order:
-        now_s = self._clock.now_s()
-        if condition.authority != "starting":
-            self._starting_since_s = now_s
-        if condition.jumps > self._jumps:
-            self._jumps, self._jumped_at_s = condition.jumps, now_s
-        position = (0.0, 0.0, 0.0) if telemetry is None else telemetry.pose[:3].tolist()
-        situation = Situation(
-            authority=condition.authority,
-            authority_reason=condition.reason,
-            starting_s=now_s - self._starting_since_s,
-            battery=1.0 if telemetry is None else telemetry.battery,
-            telemetry_age_s=math.inf if telemetry is None else self._silence.look(telemetry.stamp_s, now_s),
-            outside_m=0.0 if telemetry is None else outside_m(self._mission.flight, position),
-            jump_age_s=now_s - self._jumped_at_s,
-            gimbal_lost=condition.gimbal_lost,
-            ground_away_s=0.0 if self._lockstep else self._ground_silence.look(self._ground_heard_s, self._now_s()),
-            finished=self._finished,
-        )
-        order = self._policies.decide(situation)
-        if order != self._order:
-            level = logging.INFO if order.action in ("fly", "wait") else logging.WARNING
-            log.log(level, "%s: %s %s", order.action, order.policy, f"({order.reason})" if order.reason else "")
-        self._order = order
-        return order
+    def _give_orders(self, telemetry: Telemetry | None, condition: Condition) -> Order:
+        silence = None if self._lockstep else (self._ground_heard_s, self._now_s())
+        return self._orders.give(telemetry, condition, silence, self._finished)
 
     def _publish(self, telemetry: Telemetry, tick: int, mode: Mode, blind_s: float = 0.0) -> None:
         state = self._state_of(telemetry, tick, mode, blind_s)

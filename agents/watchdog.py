@@ -13,6 +13,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
+from agents.silence import WitnessedSilence
 from protocol.errors import CovreconError
 
 log = logging.getLogger(__name__)
@@ -45,9 +46,7 @@ class Watchdog:
         self._fed_at: float | None = None
         self._stopped_at: float | None = None
         self._given_up_at: float | None = None
-        self._silent_since: float | None = None
-        self._checked_at = -math.inf
-        self._silence_s = 0.0
+        self._silence = WitnessedSilence(timeout_s)
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
         self.stops = 0
@@ -70,20 +69,12 @@ class Watchdog:
         fed_at, now = self._fed_at, self._now()
         if fed_at is None:
             return False
-        silence_s = self._witnessed(fed_at, now)
+        silence_s = self._silence.look(fed_at, now)
         try:
             stopped = self._stop_if_overdue(fed_at, now)
         finally:
             given_up = self._give_up_if_overdue(fed_at, silence_s)
         return stopped or given_up
-
-    def _witnessed(self, fed_at: float, now: float) -> float:
-        """The silence after ``fed_at``, without what exceeds ``timeout_s`` between two checks."""
-        if fed_at != self._silent_since:
-            self._silent_since, self._silence_s, self._checked_at = fed_at, 0.0, fed_at
-        self._silence_s += min(now - self._checked_at, self._timeout_s)
-        self._checked_at = now
-        return self._silence_s
 
     def _stop_if_overdue(self, fed_at: float, now: float) -> bool:
         if fed_at == self._stopped_at or now - fed_at <= self._timeout_s:

@@ -107,7 +107,7 @@ def run(
         checked,
         display,
         out=out,
-        speed="1" if checked.vehicles.kind == "px4" else speed,
+        speed=speed,
         started=datetime.now(UTC),
         restarts=restart,
         with_autopilots=vehicles == "px4-endpoint",

@@ -264,6 +264,11 @@ class Drone(Settings):
     """This drone's real camera: an RTSP URL, a V4L2 device such as /dev/video0, or a video file. Empty: the simulator
     renders what it would see."""
 
+    @property
+    def mavlink_system(self) -> int:
+        """The id that its vehicle must have."""
+        return self.system_id or self.id
+
 
 class Mission(Settings):
     """The whole mission. ``drones`` may be left out: then ``covrecon run --drones N`` places them."""
@@ -356,7 +361,7 @@ class Mission(Settings):
         urls: dict[str, int] = {}
         systems: dict[int, int] = {}
         for index, drone in enumerate(self.drones):
-            url, system = self.vehicle_url(drone), drone.system_id or drone.id
+            url, system = self.vehicle_url(drone), drone.mavlink_system
             if url in urls:
                 faults.append(f"drones.{index}.url: {url} is drone {urls[url]}'s already")
             if system in systems:

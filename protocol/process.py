@@ -54,7 +54,8 @@ def parse(role: str, arguments: list[str] | None = None) -> Arguments:
     drone = getattr(parsed, "drone", 0)
     if role == "agents" and drone not in {known.id for known in mission.drones}:
         raise MissionError([f"{parsed.mission}: drones: there is no drone {drone}"])
-    return Arguments(mission, parsed.endpoint, parsed.run, parsed.speed == "max", drone)
+    lockstep = parsed.speed == "max" and mission.vehicles.kind == "simulated"  # nothing makes a PX4 wait
+    return Arguments(mission, parsed.endpoint, parsed.run, lockstep, drone)
 
 
 def run_process(role: str, body: Callable[[Arguments], Coroutine[None, None, None]]) -> int:

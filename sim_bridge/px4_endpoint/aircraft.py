@@ -39,7 +39,7 @@ class Aircraft:
         here = ned((x, y, 0.0))
         origin = here if mission.vehicles.origin else (0.0, 0.0, 0.0)
         self.parameters = Parameters()
-        self.parameters.set("MAV_SYS_ID", drone.system_id or drone.id)
+        self.parameters.set("MAV_SYS_ID", drone.mavlink_system)
         self.commander = Commander(self.parameters)
         self.guidance = Guidance(self.parameters)
         self.guidance.home = (here[0] - origin[0], here[1] - origin[1], here[2] - origin[2])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import selectors
 import threading
 import time
@@ -18,8 +17,6 @@ STEP_S = 0.01
 """Of the simulation; streams are sent on it too."""
 BEHIND_MAX_S = 0.2
 """A thread that is later than this (stopped, or starved) leaves out what it missed instead of hurrying after it."""
-
-log = logging.getLogger(__name__)
 
 
 class Endpoint:
@@ -67,14 +64,10 @@ class Endpoint:
         self.stop()
 
     def _run(self) -> None:
-        try:
-            with selectors.DefaultSelector() as selector:
-                for vehicle in self.vehicles.values():
-                    selector.register(vehicle.link.socket, selectors.EVENT_READ, vehicle)
-                self._simulate(selector)
-        except Exception:
-            log.exception("the endpoint failed")
-            raise
+        with selectors.DefaultSelector() as selector:
+            for vehicle in self.vehicles.values():
+                selector.register(vehicle.link.socket, selectors.EVENT_READ, vehicle)
+            self._simulate(selector)
 
     def _simulate(self, selector: selectors.BaseSelector) -> None:
         due_s = time.monotonic()

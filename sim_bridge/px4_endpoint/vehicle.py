@@ -50,7 +50,7 @@ class Vehicle:
     def __init__(self, mission: Mission, drone: Drone) -> None:
         self.drone = drone
         self.aircraft = Aircraft(mission, drone)
-        self.link = Link(mission.vehicle_url(drone), drone.system_id or drone.id)
+        self.link = Link(mission.vehicle_url(drone), drone.mavlink_system)
         self.setpoints = SetpointTimes()
         self.on_setpoint: Callable[[int, float, Target], None] | None = None
         """Called with the drone's id, the arrival by CLOCK_MONOTONIC and the setpoint, on the endpoint's thread."""

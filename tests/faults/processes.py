@@ -82,6 +82,19 @@ class HarnessError(Exception):
     """A flight that did not do what it should within its bound."""
 
 
+def processes_of(folder: Path, module: str = "") -> list[int]:
+    """Processes that were started with a path in ``folder``, all or those of one module."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            command = (entry / "cmdline").read_bytes().decode(errors="replace")
+        except OSError:
+            continue  # it ended while we looked
+        if str(folder) in command and (not module or f"\0-m\0{module}\0" in command):
+            found.append(int(entry.name))
+    return found
+
+
 def write_scene(folder: Path) -> Path:
     """A table on a floor, every face covered with random patches: as small as a world can be and still be mapped."""
     patches = np.random.default_rng(7).integers(0, 255, (20, 20, 3), dtype=np.uint8)

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from faults.processes import write_scene
+from faults.processes import processes_of, write_scene
 from faults.px4_flight import free_ports
 from ground_station.keyframe_log import KeyframeLog
 
@@ -133,7 +133,7 @@ def test_drones_fly_on_while_nobody_beats_the_time(tmp_path: Path, fly: Fly) -> 
     run = fly("--restart", "1")
     folder = tmp_path / "runs" / "latest"
     wait_for(lambda: "ours" in log_of(folder, "drone-1") or _is_flying(folder), "never took off")
-    (observer,) = _processes(tmp_path, "sim_bridge")
+    (observer,) = processes_of(tmp_path, "sim_bridge")
     os.kill(observer, signal.SIGKILL)
     output, _ = run.communicate(timeout=LIMIT_S)
 
@@ -184,15 +184,3 @@ def photographers(folder: Path) -> dict[int, int]:
 def _is_flying(folder: Path) -> bool:
     metrics = folder / "metrics.csv"
     return metrics.exists() and any(float(line.split(",")[2]) < 1 for line in metrics.read_text().splitlines()[1:])
-
-
-def _processes(folder: Path, module: str) -> list[int]:
-    found = []
-    for entry in Path("/proc").glob("[0-9]*"):
-        try:
-            command = (entry / "cmdline").read_bytes().decode(errors="replace")
-        except OSError:
-            continue
-        if str(folder) in command and f"\0-m\0{module}\0" in command:
-            found.append(int(entry.name))
-    return found

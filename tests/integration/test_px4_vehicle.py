@@ -213,7 +213,7 @@ async def test_a_watchdog_holds_the_vehicle_while_the_event_loop_is_blocked() ->
         watchdog = threading.Thread(target=watch)
         watchdog.start()
         watchdog.join()  # the loop is blocked until then, and for long enough for a heartbeat
-        time.sleep(1.2)  # noqa: ASYNC251
+        time.sleep(1.2)  # noqa: ASYNC251  # the loop is blocked on purpose
         assert flight.there.mode.name == "HOLD"
         assert took_s[0] < 1.0
         await asyncio.sleep(0.2)

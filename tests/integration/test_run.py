@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from faults.processes import write_scene
+from faults.processes import processes_of, write_scene
 
 COVRECON = Path(sys.executable).with_name("covrecon")
 Write = Callable[..., Path]
@@ -85,19 +85,6 @@ def fly(tmp_path: Path) -> Iterator[Fly]:
             run.kill()
         run.communicate()
     wait_for(lambda: not processes_of(tmp_path), "processes left behind")
-
-
-def processes_of(folder: Path, module: str = "") -> list[int]:
-    """Processes that were started with a path in ``folder``, all or those of one module."""
-    found = []
-    for entry in Path("/proc").glob("[0-9]*"):
-        try:
-            command = (entry / "cmdline").read_bytes().decode(errors="replace")
-        except OSError:
-            continue  # it ended while we looked
-        if str(folder) in command and (not module or f"\0-m\0{module}\0" in command):
-            found.append(int(entry.name))
-    return found
 
 
 def wait_for(condition: Callable[[], object], what: str, limit_s: float = LIMIT_S) -> None:

@@ -76,6 +76,8 @@ class AuthorityLogic:
         self.phase: Phase = "ready"
         self._reason = ""
         self._refusal = ""
+        self.unheeded = ""
+        """What the vehicle acknowledged last without doing it, for people; stays until it is something else."""
         self._seen: Observation | None = None
         self._silence = WitnessedSilence()
         self._land_ordered = False
@@ -257,6 +259,7 @@ class AuthorityLogic:
             return "wait"
         if step == last and not self._refusal and self._seen is not None:
             self._refusal = f"{step.replace('_', ' ')} was acknowledged, but the vehicle stays in {self._seen.mode}"
+            self.unheeded = self._refusal
         self._answered_s = math.inf
         return step
 

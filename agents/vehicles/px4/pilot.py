@@ -50,7 +50,7 @@ class Pilot:
     ) -> None:
         self._cockpit, self._logic, self._lock, self._executor = cockpit, logic, lock, executor
         self._now_s, self._events = now_s, events
-        self._said = self._refused = ""
+        self._said = self._unheeded = ""
 
     async def run(self) -> None:
         """Until cancelled."""
@@ -59,7 +59,10 @@ class Pilot:
                 with self._lock:
                     step = self._logic.observe(self._cockpit.observe(), self._now_s())
                     phase, authority, reason = self._logic.phase, self._logic.authority, self._logic.reason
-                    streams = self._logic.streams
+                    streams, unheeded = self._logic.streams, self._logic.unheeded
+                if unheeded != self._unheeded:
+                    self._events("warning", unheeded)
+                    self._unheeded = unheeded
                 self._report(phase, authority, reason)
                 if streams:
                     self._cockpit.idle()
@@ -80,10 +83,6 @@ class Pilot:
 
     def _report(self, phase: str, authority: str, reason: str) -> None:
         """Changes of who flies, and the reason at that moment: it tells progress afterwards, which is no event."""
-        refused = reason if "acknowledged, but" in reason else ""
-        if refused not in ("", self._refused):
-            self._events("warning", refused)
-        self._refused = refused or self._refused
         if self._said != phase + authority:
             level = "warning" if authority in ("yielded", "lost") else "info"
             self._events(level, f"{authority}: {reason}" if reason else authority)

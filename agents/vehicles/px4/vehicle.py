@@ -93,7 +93,7 @@ class Px4Vehicle:
         drone = self._mission.drone(self._drone)
         owner = f"drone {drone.id} of mission {self._mission.name!r}"
         url = self._mission.vehicle_url(drone)
-        self._connection = Connection(url, drone.system_id or drone.id, owner)
+        self._connection = Connection(url, drone.mavlink_system, owner)
         await asyncio.get_running_loop().run_in_executor(self._executor, self._connection.open)
         return await self._connection.discover(self._settings.discovery_s, self._now_s)
 
