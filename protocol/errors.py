@@ -10,6 +10,9 @@
     |-- JournalError        a journal that cannot be written or read back
     |   `-- JournalDamaged  ... because what it holds is not what was written
     |-- StorageError        another file of the run that the disk refuses
+    |-- RecordingError      a recording that cannot be read, or that lacks what is asked of it
+    |-- ExportError         a run that lacks what is to be exported, or a place that cannot take it
+    |-- CommandError        an operator's command that was refused, or that not everybody has acknowledged
     |-- VehicleError        a vehicle that cannot be connected, is not fit to fly, or refuses what it is told
     |-- ReconstructionError input that the reconstructor cannot work with
     `-- ProcessError        a process of the run that failed
@@ -64,6 +67,18 @@ class JournalDamaged(JournalError):
 
 
 class StorageError(CovreconError):
+    pass
+
+
+class RecordingError(CovreconError):
+    pass
+
+
+class ExportError(CovreconError):
+    pass
+
+
+class CommandError(CovreconError):
     pass
 
 

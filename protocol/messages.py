@@ -17,13 +17,16 @@ Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
 Vector3 = tuple[Coordinate, Coordinate, Coordinate]
 Vector5 = tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate]
 """x, y, z, camera yaw, camera pitch (depression), or their rates."""
+EventLevel = Literal["info", "warning", "error"]
+Text = Annotated[str, Field(max_length=1000)]
 Outcome = Literal["solved", "infeasible", "out_of_time", "numerical", "none"]
 """What the solver said; anything but "solved" brakes. "none" before the first decision."""
 Mode = Literal["starting", "flying", "braking", "joining", "holding", "returning", "landing", "landed", "yielded"]
 """starting: on the ground or taking off; joining: waits for phi; braking: the solver found no way; holding, returning
 and landing: by a policy, or because the mission is over; landed: stands on the ground and will stay there; yielded: a
 pilot or the autopilot itself flies."""
-Phase = Literal["starting", "flying", "finished"]
+Phase = Literal["waiting", "starting", "flying", "finished"]
+"""waiting: for an operator's start."""
 
 
 class VehicleSample(Message):
@@ -122,6 +125,8 @@ class DroneState(Message):
     velocity: Vector5
     battery: Annotated[float, Field(ge=0, le=1)]
     mode: Mode
+    obeyed: Count = 0
+    """Number of the newest operator's order that it has heard (`DroneOrder.number`): the acknowledgement."""
     blind_s: Annotated[float, Field(ge=0, le=60)] = 0.0
     """How long the vehicle may have flown on since ``pose`` was true: its agent does not hear it, and it stops by
     itself."""
@@ -214,12 +219,52 @@ class PhiPage(Message):
     """float32 (positions of these blocks, directions), one block after the other."""
 
 
+class DroneOrder(Message):
+    """What an operator wants of one drone, from now on."""
+
+    name: ClassVar[str] = "drone_order"
+    drone: DroneId
+    action: Literal["fly", "hold", "return", "land"]
+    number: Count
+    """Of the command it stems from; a later one is larger."""
+
+
 class MissionPhase(Message):
     """Broadcast by the ground station, repeated: what everybody should be doing."""
 
     name: ClassVar[str] = "mission_phase"
     phase: Phase
-    reason: Annotated[str, Field(max_length=1000)]
+    reason: Text
+    orders: tuple[DroneOrder, ...] = ()
+    """Of drones that an operator has commanded something; repeated until each says that it has heard, and after."""
+
+
+class CommandReply(Message):
+    """Reply to ``command/request?id=..;verb=land;drones=3+4``; without drones it is for all. The same id is the same
+    command: whoever asks again learns how far it is."""
+
+    name: ClassVar[str] = "command_reply"
+    id: Annotated[str, Field(max_length=64)]
+    accepted: bool
+    text: Text
+    """Why it is refused, or what it does."""
+    number: Count
+    """0 if refused."""
+    awaited: tuple[DroneId, ...]
+    """Drones that have not acknowledged it yet."""
+
+
+class Event(Message):
+    """Something a person should know of, said once."""
+
+    name: ClassVar[str] = "event"
+    source: Annotated[str, Field(max_length=40)]
+    """Role of the process: "drone/3", "ground"."""
+    tick: TickNumber
+    level: EventLevel
+    kind: Annotated[str, Field(max_length=40)]
+    """What it is about: "mode", "order", "solver", "vehicle", "phi", "command", "link", "map", "disk"."""
+    text: Text
 
 
 class DroneStatus(Message):
@@ -242,7 +287,7 @@ class Status(Message):
 
     name: ClassVar[str] = "status"
     phase: Phase
-    activity: Annotated[str, Field(max_length=1000)]
+    activity: Text
     """What the ground station is doing, in words."""
     tick: TickNumber
     time_s: Finite
@@ -266,3 +311,34 @@ class Status(Message):
     min_separation_m: Finite
     """Smallest distance between two drones so far; 0 with a single drone."""
     drones: tuple[DroneStatus, ...]
+
+
+BlockNumber = Annotated[int, Field(ge=-(2**20), le=2**20)]
+
+
+class MeshBlock(Message):
+    """The part of the map in one cube of the world: the faces whose centre lies in it."""
+
+    name: ClassVar[str] = "mesh_block"
+    key: tuple[BlockNumber, BlockNumber, BlockNumber]
+    """Number of the cube along x, y, z (`ground_station.mesh_blocks`)."""
+    revision: Count
+    vertices: WireArray
+    """float32 (V, 3) metres, world frame; no vertices: the block is empty now."""
+    faces: WireArray
+    """int32 (F, 3)"""
+    colours: WireArray
+    """uint8 (V, 3) sRGB."""
+
+
+class MeshPage(Message):
+    """Reply to ``map/blocks?epoch=..;since=120``: blocks that changed after that revision, as many as fit a page."""
+
+    name: ClassVar[str] = "mesh_page"
+    epoch: Count
+    """Of the process that numbers the revisions; with another one all blocks known before are void."""
+    revision: Count
+    """What to ask for next."""
+    complete: bool
+    """Whether there was nothing left to say."""
+    blocks: tuple[MeshBlock, ...]

@@ -14,6 +14,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from protocol.geometry import Intrinsics
+from protocol.operation_settings import Console, Metrics, Recording
 from protocol.separation import widened_separation
 from protocol.settings import Angle, Metres, NonNegative, Positive, Settings, Vector
 from protocol.vehicle_settings import Autopilot, Vehicles
@@ -279,6 +280,8 @@ class Mission(Settings):
     """The mission ends after so long (paper: up to 1500 s) ..."""
     stop_below: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """... or when J falls below this."""
+    start: Literal["at_once", "on_command"] = "at_once"
+    """Whether drones take off as soon as all are there, or when an operator says "start"."""
     target: Target = Target()
     sensing: Sensing = Sensing()
     flight: Flight = Flight()
@@ -291,6 +294,9 @@ class Mission(Settings):
     autopilot: Autopilot = Autopilot()
     transport: Transport = Transport()
     replication: Replication = Replication()
+    console: Console = Console()
+    recording: Recording = Recording()
+    metrics: Metrics = Metrics()
     drones: Annotated[tuple[Drone, ...], Field(min_length=1)]
 
     @property

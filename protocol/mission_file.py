@@ -25,19 +25,19 @@ TEAM_MAX = 255
 
 
 def load_mission(
-    path: Path, *, drones: int | None = None, seed: int | None = None, vehicles: Mapping[str, str] | None = None
+    path: Path, *, drones: int | None = None, seed: int | None = None, replaced: Mapping[str, Any] | None = None
 ) -> Mission:
     """Read and check a mission: TOML, or JSON as `mission_to_json` writes it (``.json``).
 
     ``drones`` sets the team's size: the file's first drones, then more placed by `protocol.formation`. ``seed``
-    replaces the file's, and ``vehicles`` keys of its table of that name. A scene or a camera given as a path becomes
-    absolute, so that the mission may be stored elsewhere. Raises `MissionError` with one fault a line.
+    replaces the file's, and ``replaced`` any others, by dotted name (``vehicles.kind``). A scene or a camera given as a
+    path becomes absolute, so that the mission may be stored elsewhere. Raises `MissionError` with one fault a line.
     """
     raw, lines = _parse(path, _read(path))
     if seed is not None:
         raw["seed"] = seed
-    if vehicles and isinstance(table := raw.setdefault("vehicles", {}), dict):
-        table.update(vehicles)
+    for name, value in (replaced or {}).items():
+        _replace(raw, name, value)
     _resolve_scene(raw, path.parent)
     _resolve_cameras(raw, path.parent)
     faults = _complete_team(raw, drones)
@@ -47,6 +47,17 @@ def load_mission(
         faults.sort(key=lambda fault: line_of(lines, fault.path))
         raise MissionError([_sentence(path, lines, fault) for fault in faults])
     return mission.model_copy(update={"drones": mission.drones[:drones]})
+
+
+def _replace(raw: dict[str, Any], name: str, value: Any) -> None:
+    """Set one key, its table made if need be; what does not fit is found when the mission is checked."""
+    *tables, key = name.split(".")
+    for table in tables:
+        below = raw.setdefault(table, {})
+        if not isinstance(below, dict):
+            return
+        raw = below
+    raw[key] = value
 
 
 def mission_to_json(mission: Mission) -> str:
@@ -69,7 +80,8 @@ def mission_schema() -> str:
 def _read(path: Path) -> str:
     try:
         if not path.is_file():
-            raise MissionError([f"{path}: {'is not a file' if path.exists() else 'no such file'}"])
+            what = "is not a file" if path.exists() else "no such file; missions/demo.toml is one to begin with"
+            raise MissionError([f"{path}: {what}"])
         with path.open("rb") as file:
             content = file.read(SIZE_MAX + 1)
     except OSError as error:

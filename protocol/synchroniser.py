@@ -34,8 +34,8 @@ class Synchroniser:
     def __init__(
         self, bus: Bus, replication: Replication, own: int = 0, rank: Callable[[int], int] = lambda drone: drone
     ) -> None:
-        """``own``: the drone of this process, which does not ask itself; 0 for the ground station. ``rank``: of the
-        drones that may be asked, the one with the lowest is first."""
+        """``own``: the drone of this process, which does not ask itself; 0 for the ground station; less for an
+        onlooker, which asks like a drone. ``rank``: of those that may be asked, the drone with the lowest is first."""
         self._bus, self._replication, self._own, self._rank = bus, replication, own, rank
 
     @asynccontextmanager

@@ -54,10 +54,15 @@ DRONE_BLOCKS = Topic(
     "drone/{drone}/phi", messages.PhiPage, ("agent",), "BACKGROUND", 16, _NO_AGE, False, queryable=True
 )
 PHASE = Topic("command/all", messages.MissionPhase, ("ground",), "REAL_TIME", 16, 2.0, True, express=True)
-STATUS = Topic("status", messages.Status, ("ground",), "INTERACTIVE_LOW", 4, 5.0, False)
+COMMAND = Topic("command/request", messages.CommandReply, ("ground",), "REAL_TIME", 16, _NO_AGE, False, queryable=True)
+EVENT = Topic("drone/{drone}/event", messages.Event, ("agent",), "DATA_HIGH", 256, _NO_AGE, True)
+GROUND_EVENT = Topic("ground/event", messages.Event, ("ground",), "DATA_HIGH", 256, _NO_AGE, True)
+MAP = Topic("map/blocks", messages.MeshPage, ("ground",), "BACKGROUND", 4, _NO_AGE, False, queryable=True)
+STATUS = Topic("status", messages.Status, ("ground",), "INTERACTIVE_LOW", 4, 5.0, True)
 
 TOPICS: tuple[Topic[Message], ...] = (  # type: ignore[assignment]  # read-only use of an invariant generic
-    STATE, KEYFRAME, SETPOINT, TICK, JUMP, HEAD, JOURNAL, DIGEST, BLOCKS, DRONE_BLOCKS, PHASE, STATUS,
+    STATE, KEYFRAME, SETPOINT, TICK, JUMP, HEAD, JOURNAL, DIGEST, BLOCKS, DRONE_BLOCKS, PHASE, COMMAND,
+    EVENT, GROUND_EVENT, MAP, STATUS,
 )  # fmt: skip
 
 

@@ -5,8 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 TESTS = Path(__file__).parent
+
+settings.register_profile("covrecon", deadline=None)  # no test is timed: machines are shared
+settings.load_profile("covrecon")
 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist looks for the groups

@@ -29,7 +29,7 @@ LIMIT_S = 150
 def test_setpoint_path(drones: int, tmp_path: Path, record: Record) -> None:
     """Against the tick: how many times the 99th percentile fits into 50 ms."""
     url = f"udpin://127.0.0.1:{free_ports(drones)}"
-    mission = load_mission(ROOT / "missions" / "px4.toml", drones=drones, vehicles={"url": url})
+    mission = load_mission(ROOT / "missions" / "px4.toml", drones=drones, replaced={"vehicles.url": url})
     path = tmp_path / "mission.json"
     path.write_text(mission_to_json(mission))
     arrivals: dict[int, dict[int, float]] = defaultdict(dict)

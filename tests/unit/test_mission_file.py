@@ -300,11 +300,11 @@ start = [2.2, 0.0, 3.5, 0.0, 1.3]
 
 
 def test_vehicles_may_be_chosen_on_the_command_line(tmp_path: Path) -> None:
-    chosen = {"kind": "px4", "url": "udpin://127.0.0.1:20000"}
-    mission = load_mission(write(tmp_path, ONE_DRONE), vehicles=chosen, drones=2)
+    chosen = {"vehicles.kind": "px4", "vehicles.url": "udpin://127.0.0.1:20000"}
+    mission = load_mission(write(tmp_path, ONE_DRONE), replaced=chosen, drones=2)
     assert [mission.vehicle_url(drone) for drone in mission.drones] == [
         "udpin://127.0.0.1:20000",
         "udpin://127.0.0.1:20001",
     ]
     with pytest.raises(MissionError, match="no connection with a port"):
-        load_mission(write(tmp_path, ONE_DRONE), vehicles={"kind": "px4", "url": "here"})
+        load_mission(write(tmp_path, ONE_DRONE), replaced={"vehicles.kind": "px4", "vehicles.url": "here"})

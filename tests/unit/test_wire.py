@@ -15,13 +15,18 @@ from pydantic import ValidationError
 from protocol import messages
 from protocol.errors import MessageError, VersionError
 from protocol.messages import (
+    CommandReply,
     Control,
+    DroneOrder,
     DroneState,
     DroneStatus,
+    Event,
     JournalPage,
     Jump,
     JumpHead,
     Keyframe,
+    MeshBlock,
+    MeshPage,
     MissionPhase,
     PhiDigest,
     PhiPage,
@@ -64,6 +69,14 @@ ROW = DroneStatus(
     fallbacks=0,
 )
 REPLICA = ReplicaState(tick=40, epoch=5, next_jump=1, missing=0, repaired=2, lost=3)
+ORDER = DroneOrder(drone=3, action="hold", number=4)
+MESH_BLOCK = MeshBlock(
+    key=(-1, 0, 2),
+    revision=3,
+    vertices=np.array([[0.5, 0.0, 1.0], [1.0, 0.0, 1.0], [0.5, 1.0, 1.0]], np.float32),
+    faces=np.array([[0, 1, 2]], np.int32),
+    colours=np.full((3, 3), 200, np.uint8),
+)
 EXAMPLES: tuple[Message, ...] = (
     SAMPLE,
     Tick(
@@ -107,7 +120,12 @@ EXAMPLES: tuple[Message, ...] = (
     Jump(epoch=5, sequence=0, tick=140, increments=np.array([0.0, 0.5, -1.5], np.float32)),
     JumpHead(epoch=5, next_sequence=1, done=139, phase="flying"),
     JournalPage(epoch=5, first_sequence=1, next_sequence=2, jumps=(b"\x00one", b"two")),
-    MissionPhase(phase="finished", reason="J fällt unter 0,1"),
+    MissionPhase(phase="finished", reason="J fällt unter 0,1", orders=(ORDER,)),
+    ORDER,
+    CommandReply(id="a1", accepted=True, text="land: drone 3", number=4, awaited=(3,)),
+    Event(source="drone/3", tick=12, level="warning", kind="order", text="land: battery critical (battery at 9%)"),
+    MESH_BLOCK,
+    MeshPage(epoch=7, revision=3, complete=False, blocks=(MESH_BLOCK,)),
     ROW,
     REPLICA,
     PhiDigest(epoch=5, tick=60, sketches=np.array([[0.5, 1.0], [0.25, 0.0]], np.float32)),
@@ -168,6 +186,9 @@ def assert_same(one: Message, other: Message) -> None:
         if isinstance(a, np.ndarray):
             assert a.dtype == b.dtype
             np.testing.assert_array_equal(a, b)
+        elif isinstance(a, tuple) and a and isinstance(a[0], MeshBlock):
+            for inner, outer in zip(a, b, strict=True):
+                assert_same(inner, outer)
         else:
             assert a == b
 
