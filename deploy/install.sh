@@ -1,11 +1,15 @@
 #!/usr/bin/env bash
-# Installs Coverage-Recon with its tools into .venv: what `make` does before anything else. Debian 12, Ubuntu 24.04.
+# Installs Coverage-Recon into .venv: what `make` does before anything else. Debian 12, Ubuntu 24.04.
+# With "tests" as argument also what its tests and checks need.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
 # What Open3D's wheel needs from the system, and the Debian packages that hold it.
 LIBRARIES=(libEGL.so.1 libGL.so.1 libusb-1.0.so.0)
 LIBRARY_PACKAGES=(libegl1 libgl1 libusb-1.0-0)
+
+# Test programs open the console in a browser; without one they say so and are left out.
+BROWSERS=(chromium chromium-browser google-chrome)
 
 fail() {
     printf 'install: %s\n' "$@" >&2
@@ -47,20 +51,38 @@ install_system_packages() {
 # pip's output cut down to the downloads that take time.
 large_downloads() { sed -un 's/^ *Downloading \([^ ]*\) (\([0-9.]* MB\)).*/install:   \1 \2/p'; }
 
+# A browser is wished for, not needed: what cannot be had is told.
+install_browser() {
+    local name line="apt-get install -y --no-install-recommends chromium"
+    for name in "${BROWSERS[@]}"; do
+        if command -v "$name" >/dev/null; then
+            return
+        fi
+    done
+    if [[ $(id -u) == 0 ]] && command -v apt-get >/dev/null; then
+        echo "install: system packages: chromium"
+        apt-get update -qq
+        DEBIAN_FRONTEND=noninteractive $line -qq >/dev/null && return
+    fi
+    echo "install: no browser: tests of the console are left out; to run them:  sudo $line"
+}
+
+# $1: python, then what to install.
 install_packages() {
     local python=$1
+    shift
     if command -v uv >/dev/null; then
         # uv does not read pip's settings.
         export UV_FIND_LINKS=${UV_FIND_LINKS-${PIP_FIND_LINKS-$("$python" -m pip config get global.find-links 2>/dev/null || true)}}
         uv venv --quiet --allow-existing --python "$python" .venv
-        uv pip install --quiet --python .venv/bin/python --constraint constraints.txt --editable '.[ground,camera]' --group dev
+        uv pip install --quiet --python .venv/bin/python --constraint constraints.txt "$@"
     else
         "$python" -m venv .venv
         # --group came with pip 25.1.
         .venv/bin/python -m pip install --quiet --disable-pip-version-check 'pip>=25.1'
         # Setuptools' warning about editable installs is for others than `make`'s users.
         PYTHONWARNINGS=ignore .venv/bin/python -m pip install --disable-pip-version-check --progress-bar off \
-            --constraint constraints.txt --editable '.[ground,camera]' --group dev | large_downloads
+            --constraint constraints.txt "$@" | large_downloads
     fi
 }
 
@@ -75,6 +97,12 @@ fi
     "name another one: make PYTHON=/path/to/python"
 has_venv "$python" || fail "$python has no venv module: install it, or name another: make PYTHON=/path/to/python"
 
-echo "install: about 1 GB into .venv, once; a few minutes"
-install_packages "$python"
+if [[ ${1:-} == tests ]]; then
+    install_browser
+    echo "install: test tools, about 1 GB more"
+    install_packages "$python" --editable '.[ground,camera]' --group dev
+else
+    echo "install: about 1 GB into .venv, once; a few minutes"
+    install_packages "$python" --editable '.[ground,camera]'
+fi
 echo "install: done"

@@ -1,4 +1,4 @@
-"""The map as files: PLY in the world frame, GLB with y up as glTF demands, and a hash to compare maps by."""
+"""The map as files and back: PLY in the world frame, GLB with y up as glTF demands, and a hash to compare maps by."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ground_station.reconstruction.reconstructor import Mesh
+from protocol.errors import CovreconError
 
 GLB_MATERIAL = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}, "doubleSided": True}
 """Without it viewers show glTF's default, a dark metal."""
@@ -49,3 +52,40 @@ def glb(vertices: Vertices, faces: Faces, colours: Colours) -> bytes:
     linear = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
     shown = np.round(255 * linear).astype(np.uint8)[colours]
     return _exported(upright, faces, shown, "glb", tree_postprocessor=add_material)
+
+
+def read_ply(content: bytes, name: str) -> Mesh:
+    """What `ply` made.
+
+    Raises:
+        CovreconError: ``name`` is damaged, or has no triangles or colours.
+    """
+    return _read(content, name, "ply")
+
+
+def read_glb(content: bytes, name: str) -> Mesh:
+    """What `glb` made, in the world frame again; dark colours come back a little coarser than they were.
+
+    Raises:
+        CovreconError: ``name`` is damaged, or has no triangles or colours.
+    """
+    found = _read(content, name, "glb")
+    x, up, back = found.vertices.T
+    level = np.arange(256) / 255
+    encoded = np.where(level <= 0.0031308, level * 12.92, 1.055 * level ** (1 / 2.4) - 0.055)  # IEC 61966-2-1
+    shown = np.round(255 * encoded).astype(np.uint8)[found.colors]
+    return Mesh(np.column_stack([x, -back, up]), found.faces, shown)
+
+
+def _read(content: bytes, name: str, file_type: str) -> Mesh:
+    import trimesh
+
+    try:
+        # Not load_mesh, which loses the colours of a mesh with a material.
+        (mesh,) = trimesh.load_scene(io.BytesIO(content), file_type=file_type, process=False).geometry.values()
+        visual = mesh.visual
+        colours = visual.vertex_colors if visual.kind == "vertex" else visual.vertex_attributes["color"]
+        vertices, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32)
+    except (ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
+        raise CovreconError(f"{name}: no mesh with triangles and colours: {error}") from error
+    return Mesh(vertices, faces, np.asarray(colours, dtype=np.uint8)[:, :3])

@@ -3,8 +3,11 @@
 * ``mission.json``: the effective mission, every default filled in.
 * ``metrics.csv``: one row a second, readable while the run goes on and after it was killed.
 * ``trajectories.npz``: ``drones`` ids (D,), ``tick`` and ``time_s`` (T,), ``poses`` (T, D, 5), NaN where a drone was
-  not heard; of the controllers, (T, D), ``solve_time_s``, ``slack`` and ``fallback``: why the drone braked, or "".
-  Ticks between the last checkpoint and a crash are missing.
+  not heard; of the controllers, (T, D), ``solve_time_s``, ``slack``, ``telemetry_age_s``, ``separation_margin_m2``,
+  ``region_margin_m``, ``pitch_margin_rad2`` and ``fallback``: why the drone braked, or ""; of the vehicles, (T, D),
+  ``mode`` ("" where not heard) and ``battery`` (0 to 1). Ticks between the last checkpoint and a crash are missing.
+* ``phi.npz``: the final importance ``phi`` float32 (positions, directions), and its lattice: ``xs``, ``ys``, ``zs`` in
+  metres, position number = (ix * len(ys) + iy) * len(zs) + iz, and ``directions`` (directions, 3), unit vectors.
 * ``mesh.ply``, ``mesh.glb``: the map with vertex colours; PLY in the world frame, GLB with y up as glTF demands.
 * ``summary.json``: the figures by which runs are compared, and hashes that show whether two runs were the same.
 """
@@ -12,6 +15,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import io
 import json
 import logging
 import math
@@ -21,6 +25,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ground_station.durable import DiskFaults, replace_file, set_aside
 from ground_station.evaluation import Scores
 from ground_station.journal import JOURNAL_FILE
@@ -29,7 +36,8 @@ from ground_station.metrics_file import MetricsFile
 from ground_station.separation import nearest_distances
 from ground_station.trajectories import Trajectories
 from protocol.errors import MissionError, StorageError
-from protocol.messages import Control
+from protocol.field import VirtualField
+from protocol.messages import DroneState
 from protocol.mission import Mission
 
 log = logging.getLogger(__name__)
@@ -37,10 +45,13 @@ log = logging.getLogger(__name__)
 MISSION_FILE = "mission.json"
 METRICS_FILE = "metrics.csv"
 TRAJECTORIES_FILE = "trajectories.npz"
+PHI_FILE = "phi.npz"
 MESH_PLY_FILE = "mesh.ply"
 MESH_GLB_FILE = "mesh.glb"
 SUMMARY_FILE = "summary.json"
 
+METRICS_PERIOD_S = 1.0
+"""Mission time between two rows of metrics.csv."""
 DECIMALS = 6
 """Of the figures in metrics.csv and summary.json: micrometres and microseconds."""
 PACKAGES = (
@@ -187,14 +198,14 @@ class RunFolder:
         tick: int,
         time_s: float,
         poses: Mapping[int, Sequence[float]],
-        controls: Mapping[int, Control],
+        states: Mapping[int, DroneState],
     ) -> None:
         """Keep one tick; every mapping goes by drone id and may lack drones that were not heard.
 
-        ``poses`` are x, y, z in metres, yaw, pitch in radians; ``controls`` the newest decisions. Costs some ten
+        ``poses`` are x, y, z in metres, yaw, pitch in radians; ``states`` the newest heard. Costs some ten
         microseconds: it is called 200 times a second.
         """
-        self._trajectories.add(tick, time_s, poses, controls)
+        self._trajectories.add(tick, time_s, poses, states)
         for drone, distance in nearest_distances(poses).items():
             self._separations[drone] = min(self._separations[drone], distance)
             self._min_separation = min(self._min_separation, distance)
@@ -233,6 +244,18 @@ class RunFolder:
         self._mesh_sha256 = mesh_sha256(vertices, faces)
         self._replace(MESH_PLY_FILE, ply(vertices, faces, colours))
         self._replace(MESH_GLB_FILE, glb(vertices, faces, colours))
+
+    def write_phi(self, phi: NDArray[np.float32], field: VirtualField) -> None:
+        """Write the importance (positions, directions) with its lattice.
+
+        Raises:
+            StorageError: the disk refuses it.
+        """
+        content = io.BytesIO()
+        np.savez_compressed(
+            content, phi=phi, xs=field.xs, ys=field.ys, zs=field.zs, directions=field.directions, allow_pickle=False
+        )
+        self._replace(PHI_FILE, content.getvalue())
 
     def checkpoint(self) -> None:
         """Write trajectories and solver outcomes recorded so far: what is left of them if the process is killed.
@@ -289,7 +312,7 @@ class RunFolder:
         if not path.exists():
             replace_file(path, [content])
         elif path.read_bytes() != content:
-            raise MissionError([f"{path}: this run folder belongs to another mission"])
+            raise MissionError([f"{path}: this run folder belongs to another mission; take a new one: --run FOLDER"])
 
 
 def versions() -> dict[str, str]:

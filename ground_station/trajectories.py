@@ -15,15 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ground_station.durable import replace_file
-from protocol.messages import Control
+from protocol.messages import Control, DroneState
 
 COORDINATES = 5
 """x, y, z in metres, yaw and pitch in radians."""
 UNREADABLE = (OSError, RuntimeError, KeyError, EOFError, struct.error, zlib.error, zipfile.BadZipFile)
 """What zipfile and numpy raise, beside ValueError, on damaged files; found by changing every byte of one."""
 
-_UNHEARD = (math.nan,) * 3
-"""Solve time, slack and age of the telemetry of a drone that has decided nothing."""
+_OF_CONTROL = (
+    "solve_time_s", "slack", "telemetry_age_s", "separation_margin_m2", "region_margin_m", "pitch_margin_rad2",
+)  # fmt: skip
+_UNDECIDED = (math.nan,) * len(_OF_CONTROL)
+_ADDED_LATER = ("mode", "battery", "separation_margin_m2", "region_margin_m", "pitch_margin_rad2")
+"""Files that were written before these were kept lack them."""
 
 
 class Trajectories:
@@ -36,42 +40,41 @@ class Trajectories:
         self._flown = self._as_arrays([])
 
     def add(
-        self,
-        tick: int,
-        time_s: float,
-        poses: Mapping[int, Sequence[float]],
-        controls: Mapping[int, Control],
+        self, tick: int, time_s: float, poses: Mapping[int, Sequence[float]], states: Mapping[int, DroneState]
     ) -> None:
-        """Every mapping goes by drone id and may lack drones that were not heard."""
+        """``poses`` are what phi was integrated with, ``states`` the newest that each drone told.
+
+        Both go by drone id and may lack drones that were not heard. No state is held on to.
+        """
         pose_row = np.full((len(self._drones), COORDINATES), np.nan)
         for drone, pose in poses.items():
             pose_row[self._column[drone]] = pose
-        heard = [controls.get(drone) for drone in self._drones]
-        numbers = [_UNHEARD if each is None else (each.solve_s, each.slack, each.telemetry_age_s) for each in heard]
-        braked = ["" if each is None or each.outcome == "solved" else each.outcome for each in heard]
-        self._rows.append((tick, time_s, pose_row, numbers, braked))
+        heard = [states.get(drone) for drone in self._drones]
+        controls = [None if state is None else state.control for state in heard]
+        numbers = [_UNDECIDED if control is None else _numbers(control) for control in controls]
+        braked = ["" if control is None or control.outcome == "solved" else control.outcome for control in controls]
+        modes = ["" if state is None else state.mode for state in heard]
+        batteries = [math.nan if state is None else state.battery for state in heard]
+        self._rows.append((tick, time_s, pose_row, numbers, braked, modes, batteries))
 
     def write(self, path: Path) -> None:
         """Write all that is flown by now. Raises OSError."""
         content = io.BytesIO()
-        arrays: dict[str, Any] = {"drones": np.array(self._drones), **self._settled()}
+        arrays: dict[str, Any] = self.arrays()
         np.savez_compressed(content, **arrays)
         replace_file(path, [content.getvalue()])
 
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """All that is flown by now, by the names and in the shapes of the file."""
+        return {"drones": np.array(self._drones), **self._settled()}
+
     def read(self, path: Path) -> None:
         """Go on from what ``path`` holds. Raises OSError, and ValueError if it is damaged or of other drones."""
-        content = path.read_bytes()
-        try:
-            if zipfile.ZipFile(io.BytesIO(content)).testzip() is not None:  # numpy looks into it before it checks it
-                raise ValueError("damaged")
-            with np.load(io.BytesIO(content)) as file:
-                flown = {name: file[name] for name in self._flown}
-                drones = file["drones"].tolist()
-        except UNREADABLE as error:
-            raise ValueError(f"damaged: {error}") from error
+        flown = read_trajectories(path)
+        drones = flown["drones"].tolist()
         if drones != self._drones:
             raise ValueError(f"holds drones {drones}")
-        self._flown = flown
+        self._flown = {name: flown[name] for name in self._flown}
 
     def fallbacks(self) -> dict[int, int]:
         """Ticks in which each drone braked instead of following its controller."""
@@ -88,15 +91,51 @@ class Trajectories:
         return self._flown
 
     def _as_arrays(self, rows: Sequence[tuple[Any, ...]]) -> dict[str, NDArray[Any]]:
-        ticks, times, poses, numbers, fallbacks = zip(*rows, strict=True) if rows else ((),) * 5
+        ticks, times, poses, numbers, fallbacks, modes, batteries = zip(*rows, strict=True) if rows else ((),) * 7
         shape = (len(rows), len(self._drones))
-        solve_times, slacks, ages = np.moveaxis(np.array(numbers, np.float64).reshape(*shape, len(_UNHEARD)), -1, 0)
+        of_control = np.moveaxis(np.array(numbers, np.float64).reshape(*shape, len(_OF_CONTROL)), -1, 0)
         return {
             "tick": np.array(ticks, dtype=np.int64),
             "time_s": np.array(times, dtype=np.float64),
             "poses": np.array(poses, dtype=np.float64).reshape(*shape, COORDINATES),
-            "solve_time_s": solve_times,
-            "slack": slacks,
-            "telemetry_age_s": ages,
+            **dict(zip(_OF_CONTROL, of_control, strict=True)),
             "fallback": np.array(fallbacks, dtype=np.str_).reshape(shape),
+            "mode": np.array(modes, dtype=np.str_).reshape(shape),
+            "battery": np.array(batteries, dtype=np.float64).reshape(shape),
         }
+
+
+def read_trajectories(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of a file by name; what files of earlier versions lack is "" or NaN.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is damaged.
+    """
+    content = path.read_bytes()
+    try:
+        if zipfile.ZipFile(io.BytesIO(content)).testzip() is not None:  # numpy looks into it before it checks it
+            raise ValueError("damaged")
+        with np.load(io.BytesIO(content)) as file:
+            flown = {name: file[name] for name in file.files}
+        shape = (len(flown["tick"]), len(flown["drones"]))
+        for name in _ADDED_LATER:
+            flown.setdefault(name, np.full(shape, "" if name == "mode" else math.nan))
+        for name in ("poses", *_OF_CONTROL, "fallback", "mode", "battery"):
+            if flown[name].shape[:2] != shape:
+                raise ValueError(f"damaged: {name} is of shape {flown[name].shape}")
+    except UNREADABLE as error:
+        raise ValueError(f"damaged: {error}") from error
+    return flown
+
+
+def _numbers(control: Control) -> tuple[float, ...]:
+    """In the order of `_OF_CONTROL`."""
+    return (
+        control.solve_s,
+        control.slack,
+        control.telemetry_age_s,
+        control.separation_margin_m2,
+        control.region_margin_m,
+        control.pitch_margin_rad2,
+    )

@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 
 from deploy.outcome import describe, read_outcome
+from faults.told import told
 from ground_station.evaluation import Score, Scores
 from ground_station.results import Metrics, RunFolder
 from protocol.errors import ProcessError
 from protocol.guard import ROOT
-from protocol.messages import Control
 from protocol.mission_file import load_mission, mission_to_json
 
 DEMO = load_mission(ROOT / "missions" / "demo.toml")
@@ -40,8 +40,7 @@ def test_what_the_ground_station_writes_is_told_beside_the_baseline(tmp_path: Pa
 
 def test_a_run_without_a_truth_has_no_scores_to_tell(tmp_path: Path) -> None:
     run = RunFolder(tmp_path, DEMO)
-    braked = Control.model_construct(solve_s=0.001, slack=0.0, outcome="infeasible", telemetry_age_s=0.0)
-    run.record_tick(0, 0.0, {1: (0, 0, 2, 0, 1), 2: (1.25, 0, 2, 0, 1)}, {2: braked})
+    run.record_tick(0, 0.0, {1: (0, 0, 2, 0, 1), 2: (1.25, 0, 2, 0, 1)}, {2: told(outcome="infeasible")})
     final = Metrics(time_s=1.0, tick=20, importance=0.9, scores=None, jumps=0, keyframes=0)
     run.finish(final, floor_baseline=None, phi_sha256="", wall_time_s=1.0, exit_reason="time is up")
     run.close()

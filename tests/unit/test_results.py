@@ -18,11 +18,11 @@ import pytest
 import trimesh
 
 from faults.disk import FullDisk, dies, in_child
+from faults.told import told
 from ground_station.evaluation import Score, Scores
 from ground_station.mesh_files import mesh_sha256
 from ground_station.results import Metrics, RunFolder, versions
 from protocol.errors import MissionError, StorageError
-from protocol.messages import Control
 from protocol.mission import Drone, Mission
 
 MISSION = Mission(
@@ -48,21 +48,17 @@ def metrics(tick: int, scores: Scores | None = SCORES) -> Metrics:
     return Metrics(time_s=tick / 20, tick=tick, importance=0.4321, scores=scores, jumps=3, keyframes=42)
 
 
-def decision(*, solve_s: float, slack: float, outcome: str) -> Control:
-    return Control.model_construct(solve_s=solve_s, slack=slack, outcome=outcome, telemetry_age_s=0.01)
-
-
 def fly(run: RunFolder, first: int, last: int) -> None:
     """Two drones that come nearer by 1 cm a tick; drone 4 falls silent at tick 7 and brakes at every fourth."""
     for tick in range(first, last):
         poses = {1: (0.0, 0.0, 2.0, 0.1, 1.2), 4: (3.0 - 0.01 * tick, 0.0, 2.0, 0.2, 1.3)}
         if tick == 7:
             del poses[4]
-        controls = {
-            1: decision(solve_s=0.001, slack=0.0, outcome="solved"),
-            4: decision(solve_s=0.002, slack=0.5, outcome="infeasible" if tick % 4 == 0 else "solved"),
+        states = {
+            1: told(solve_s=0.001, slack=0.0),
+            4: told(solve_s=0.002, slack=0.5, outcome="infeasible" if tick % 4 == 0 else "solved"),
         }
-        run.record_tick(tick, tick / 20, poses, controls)
+        run.record_tick(tick, tick / 20, poses, states)
 
 
 def finish(run: RunFolder, tick: int = 10) -> dict[str, object]:
@@ -366,7 +362,7 @@ def test_a_damaged_record_is_set_aside_and_the_flight_goes_on(
     damaged = {}
     for name in ("metrics.csv", "trajectories.npz"):
         content = bytearray((folder.path / name).read_bytes())
-        content[5 if name == "metrics.csv" else len(content) // 2] ^= 1
+        content[5 if name == "metrics.csv" else content.index(b"poses.npy") + 100] ^= 1
         (folder.path / name).write_bytes(content)
         damaged[f"{name}.damaged-1"] = bytes(content)
 
