@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Self
+from typing import Protocol, Self
 
 from ground_station.durable import DiskFaults
 from ground_station.record_file import HEAD_BYTES, GrowingFile, lay_out, record
@@ -20,6 +20,33 @@ from protocol.wire import decode, encode
 log = logging.getLogger(__name__)
 
 KEYFRAMES_FILE = "keyframes"
+
+
+class KeyframeStore(Protocol):
+    """What the map needs of the place where its keyframes are kept; see `KeyframeLog`."""
+
+    @property
+    def count(self) -> int: ...
+    @property
+    def end(self) -> int: ...
+    def append(self, keyframe: Keyframe) -> None: ...
+    def sync(self) -> None: ...
+    def read(self, first: int, last: int) -> Iterator[tuple[int, Keyframe]]: ...
+
+
+class NoKeyframes:
+    """Keeps none: of a map that is made from what is kept already."""
+
+    count = end = 0
+
+    def append(self, keyframe: Keyframe) -> None:
+        """Nothing is to be done."""
+
+    def sync(self) -> None:
+        """Nothing is to be done."""
+
+    def read(self, first: int, last: int) -> Iterator[tuple[int, Keyframe]]:  # noqa: ARG002  # the protocol's
+        return iter(())
 
 
 class KeyframeLog:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from ground_station.evaluation import FULL_SAMPLES, LIVE_SAMPLES, Scores, Truth, floor_baseline, load_truth, score
-from ground_station.keyframe_log import KeyframeLog
+from ground_station.keyframe_log import KeyframeStore
 from ground_station.mesh_change import GridMeshChange
 from ground_station.reconstruction.backends import make_reconstructor
 from ground_station.reconstruction.reconstructor import Keyframe, Mesh, State
@@ -56,7 +56,7 @@ class MapState:
 class Mapper:
     """Not thread-safe on purpose: all calls come from one worker."""
 
-    def __init__(self, mission: Mission, field: VirtualField, run: Path, keyframes: KeyframeLog) -> None:
+    def __init__(self, mission: Mission, field: VirtualField, run: Path, keyframes: KeyframeStore) -> None:
         """``run`` is where the truth is looked for, ``keyframes`` where all that are added are kept."""
         self._mission, self._run, self._log = mission, run, keyframes
         self._rules: dict[int, KeyframeRule] = {}

@@ -1,0 +1,109 @@
+"""Flights of real processes with a real map, and their replays in the process that people start."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from faults.processes import write_scene
+
+pytestmark = pytest.mark.processes
+
+COVRECON = Path(sys.executable).with_name("covrecon")
+LIMIT_S = 150
+"""For one command on a busy machine, compiling included."""
+
+MISSION = """
+name = "small"
+duration_s = 8.0
+[target]
+lower_m = [-1.0, -1.0, 0.0]
+upper_m = [1.0, 1.0, 0.6]
+[flight]
+lower_m = [-2.0, -2.0, 0.5]
+upper_m = [2.0, 2.0, 2.5]
+[controller]
+coverage_rate_per_s = 0.2
+[feedback]
+threshold = 1.0
+period_s = 1.0
+delay_s = 0.5
+[camera]
+width_px = 160
+height_px = 90
+[reconstruction]
+sweep_width_px = 80
+depth_planes = 32
+[simulation]
+scene = "{scene}"
+[[drones]]
+id = 1
+start = [-0.8, 0.0, 1.4, 0.0, 1.3]
+[[drones]]
+id = 3
+start = [0.8, 0.0, 1.4, 3.0, 1.3]
+"""
+
+
+@dataclass(frozen=True)
+class Flight:
+    folder: Path
+    jumps: int
+
+
+def covrecon(*arguments: str | Path) -> tuple[int, str]:
+    done = subprocess.run([COVRECON, *arguments], capture_output=True, text=True, timeout=LIMIT_S, check=False)
+    return done.returncode, done.stdout + done.stderr
+
+
+def fly(folder: Path, speed: str) -> Flight:
+    mission = folder / "small.toml"
+    mission.write_text(MISSION.format(scene=write_scene(folder)))
+    code, output = covrecon("run", mission, "--headless", "--speed", speed, "--out", folder / "runs")
+    assert code == 0, output
+    run = (folder / "runs" / "latest").resolve()
+    return Flight(run, json.loads((run / "summary.json").read_text())["jumps"])
+
+
+@pytest.fixture(scope="module")
+def lockstep(tmp_path_factory: pytest.TempPathFactory) -> Flight:
+    return fly(tmp_path_factory.mktemp("lockstep"), "max")
+
+
+def test_a_flight_in_lockstep_is_replayed_to_the_last_bit(lockstep: Flight, tmp_path: Path) -> None:
+    code, output = covrecon("replay", lockstep.folder, "--out", tmp_path / "again")
+
+    assert code == 0, output
+    assert f"same phi, same map, {lockstep.jumps} jumps equal" in output
+    assert lockstep.jumps > 0
+    for name in ("metrics.csv", "mesh.ply", "mission.json"):
+        assert (tmp_path / "again" / name).read_bytes() == (lockstep.folder / name).read_bytes(), name
+
+
+def test_without_a_map_the_replay_never_jumps(lockstep: Flight) -> None:
+    recording = lockstep.folder / "recording.mcap"
+
+    code, output = covrecon("replay", recording, "--set", "reconstruction.backend=none")
+
+    folder = lockstep.folder / "recording-replay-1"
+    summary = json.loads((folder / "summary.json").read_text())
+    assert code == 0, output
+    assert summary["jumps"] == 0
+    assert summary["mesh_sha256"] is None
+    assert summary["J"] < json.loads((lockstep.folder / "summary.json").read_text())["J"]
+    assert f"report: {folder / 'report.html'}" in output
+
+
+def test_a_flight_in_real_time_is_replayed_to_the_last_bit(tmp_path: Path) -> None:
+    flight = fly(tmp_path, "1")
+
+    code, output = covrecon("replay", flight.folder)
+
+    assert code == 0, output
+    assert f"same phi, same map, {flight.jumps} jumps equal" in output
+    assert flight.jumps > 0
