@@ -10,10 +10,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ground_station.report.figures import drone_colour
+from ground_station.palette import drone_colour
+from ground_station.report.faults import SEVERITIES, Severity, faults
 from ground_station.report.run_data import Flight, Run
 
 UNKNOWN = "–"
+MOST_FAULTS = 100
+"""Rows that are shown."""
 SURFACES = ("visible", "exposed", "objects")
 State = Literal["", "good", "bad"]
 
@@ -49,6 +52,17 @@ class DroneRow:
     slack: str
     fallbacks: str
     """How many ticks, and for which reasons."""
+    battery: str
+    """At the end, in percent."""
+
+
+@dataclass(frozen=True, slots=True)
+class FaultRow:
+    time: str
+    duration: str
+    source: str
+    text: str
+    severity: Severity
 
 
 def number(value: float, decimals: int, unit: str = "") -> str:
@@ -157,6 +171,7 @@ def _drone_row(run: Run, flight: Flight, index: int) -> DroneRow:
     slack = np.abs(flight.slack[np.isfinite(flight.slack[:, index]), index])
     distance = run.curves.get(f"separation_{drone}_m", np.empty(0))
     distance = distance[np.isfinite(distance)]
+    battery = flight.battery[np.isfinite(flight.battery[:, index]), index]
     reasons = Counter(reason for reason in flight.fallback[:, index].tolist() if reason)
     named = ", ".join(f"{reason} {count:,}" for reason, count in sorted(reasons.items()))
     return DroneRow(
@@ -169,7 +184,25 @@ def _drone_row(run: Run, flight: Flight, index: int) -> DroneRow:
         solve_longest=number(float(solve_ms.max()) if len(solve_ms) else math.nan, 2),
         slack=f"{slack.max():.3g}" if len(slack) else UNKNOWN,
         fallbacks=f"{reasons.total():,} ({named})" if reasons else "0",
+        battery=number(100 * float(battery[-1]) if len(battery) else math.nan, 0, " %"),
     )
+
+
+def fault_rows(run: Run) -> tuple[list[FaultRow], int]:
+    """In the order of time, and how many are left out: of too many the gravest stay."""
+    found = faults(run)
+    kept = sorted(found, key=lambda fault: -SEVERITIES.index(fault.severity))[:MOST_FAULTS]
+    rows = [
+        FaultRow(
+            time=number(fault.start_s, 1, " s"),
+            duration=number(fault.end_s - fault.start_s, 1, " s") if fault.end_s > fault.start_s else "",
+            source=fault.source.replace("/", " "),
+            text=fault.text,
+            severity=fault.severity,
+        )
+        for fault in sorted(kept, key=found.index)
+    ]
+    return rows, len(found) - len(rows)
 
 
 def settings(run: Run) -> list[tuple[str, list[tuple[str, str]]]]:

@@ -17,6 +17,7 @@ from ground_station.report.run_data import Mesh
 from protocol.geometry import Floats, optical_axis
 
 Picture: TypeAlias = NDArray[np.uint8]
+Vertices: TypeAlias = NDArray[np.float32]
 Rays: TypeAlias = NDArray[np.float32]
 
 SUPERSAMPLING = 2
@@ -38,14 +39,19 @@ EDGE_FLOOR = 0.45
 BACKGROUND = 255
 
 
-def oblique_view(mesh: Mesh, width: int, height: int) -> Picture:
-    """The whole mesh from a corner, in perspective; uint8 (height, width, 3), white behind."""
+def oblique_view(mesh: Mesh, width: int, height: int, framed: Vertices | None = None) -> Picture:
+    """The whole mesh from a corner, in perspective; uint8 (height, width, 3), white behind.
+
+    ``framed``: points (n, 3) that just fit into the picture; the mesh's own by default.
+    """
+    if framed is None:
+        framed = mesh.vertices
     forward = optical_axis(VIEW_YAW_RAD, VIEW_PITCH_RAD)
     right = np.array([math.sin(VIEW_YAW_RAD), -math.cos(VIEW_YAW_RAD), 0.0])
     down = np.cross(forward, right)
     tangent = np.array([width / height, 1.0]) * math.tan(VERTICAL_FOV_RAD / 2)
-    centre = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
-    around = mesh.vertices - centre
+    centre = (framed.min(axis=0) + framed.max(axis=0)) / 2
+    around = framed - centre
     sideways = np.column_stack([around @ right, around @ down])
     ahead = (around @ forward)[:, None]
     # Each side of the frame is a plane through the camera; the farthest vertex beyond it tells where it must stand.

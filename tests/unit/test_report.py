@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from faults.told import told
 from ground_station.evaluation import Score, Scores
 from ground_station.report import page, write_report
 from ground_station.report.picture import oblique_view, view_from_above
-from ground_station.report.run_data import Mesh, load_run
+from ground_station.report.run_data import Mesh
+from ground_station.report.run_folder import load_run
 from ground_station.results import Metrics, RunFolder
 from protocol.errors import CovreconError, MissionError
-from protocol.messages import Control
 from protocol.mission import Drone, Feedback, Mission, Reconstruction
 
 SCORES = Scores(visible=Score.of(0.96, 0.8), exposed=Score.of(0.96, 0.7), objects=Score.of(0.9, 0.6))
@@ -33,6 +34,7 @@ RED, BLUE = (200, 40, 40), (40, 60, 200)
 def _small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(page, "OBLIQUE_PX", SMALL_PX)
     monkeypatch.setattr(page, "PLAN_PX", 90)
+    monkeypatch.setattr(page, "replay_page", lambda *_: "<!doctype html>")  # test_replay_page.py
 
 
 def team(drones: int, **settings: object) -> Mission:
@@ -60,16 +62,16 @@ def flown(
     for tick in range(TICKS):
         angles = {drone: 0.02 * tick + 2 * math.pi * drone / len(ids) for drone in ids}
         poses = {drone: (2 * math.cos(a), 2 * math.sin(a), 2.0, 0.1, 1.3) for drone, a in angles.items()}
-        controls = {
-            drone: Control.model_construct(
+        states = {
+            drone: told(
                 solve_s=float(rng.lognormal(-7, 0.3)),
                 slack=-0.25,
                 outcome="infeasible" if drone == ids[-1] and tick in (50, 51) else "solved",
-                telemetry_age_s=0.0,
+                battery=1 - tick / 1000,
             )
             for drone in ids
         }
-        run.record_tick(tick, tick / 20, poses, controls)
+        run.record_tick(tick, tick / 20, poses, states)
         if tick % 20 == 0:
             importance = math.exp(-tick / 200)
             jumps += importance < mission.feedback.threshold and mission.feedback.method != "none"
@@ -94,6 +96,7 @@ class Page(html.parser.HTMLParser):
     """Words of a page, its tags, and every address it refers to; refuses tags that do not nest."""
 
     VOID = frozenset({"meta", "link", "img"})
+    REFERENCES = frozenset({"src", "href", "xlink:href", "action", "data-page"})
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -108,7 +111,7 @@ class Page(html.parser.HTMLParser):
         self.tags.append(tag)
         if tag not in self.VOID:
             self._open.append(tag)
-        self.addresses += [value or "" for name, value in attrs if name in {"src", "href", "xlink:href", "action"}]
+        self.addresses += [value or "" for name, value in attrs if name in self.REFERENCES]
 
     def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.handle_starttag(tag, attrs)
@@ -153,14 +156,19 @@ def test_a_complete_run_is_told_in_full(tmp_path: Path) -> None:
     assert "ended: duration of 20 s reached" in shown.words
     assert "2 (infeasible 2)" in shown.words
     assert "0.25" in shown.words  # largest slack
-    assert shown.tags.count("svg") == 5
+    assert shown.tags.count("svg") == 9
+    assert shown.words.count("60 %") == 3  # battery left
+    assert shown.words[shown.words.index("Faults seen") :][5:9] == [
+        "2.5 s", "0.1 s", "drone 3", "braked for 2 ticks: infeasible 2"
+    ]  # fmt: skip
     assert {"[sensing]", "sigma_axis", "0.07", "9f" * 32} <= set(shown.words)
 
 
 def test_the_page_asks_the_network_for_nothing(tmp_path: Path) -> None:
     shown = page_of(flown(tmp_path, team(2)))
     assert shown.addresses
-    assert all(address.startswith(("data:", "#")) for address in shown.addresses)
+    assert all(address.startswith(("data:", "#")) or address == "replay.html" for address in shown.addresses)
+    assert (tmp_path / "replay.html").exists()
     assert "script" not in shown.tags
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert not re.findall(r"url\((?!#)|@import", text)
@@ -198,7 +206,7 @@ def test_one_drone_without_feedback_map_and_truth_still_gets_a_page(tmp_path: Pa
     assert told["Keyframes"][1] == "no reconstruction"
     assert "The mission reconstructs nothing (reconstruction.backend is none)." in shown.words
     assert "One drone: nobody to keep apart from." in shown.words
-    assert shown.tags.count("svg") == 3
+    assert shown.tags.count("svg") == 7
     assert not (tmp_path / "mesh.png").exists()
 
 
@@ -206,7 +214,9 @@ def test_a_run_that_never_took_off_gets_a_page(tmp_path: Path) -> None:
     RunFolder(tmp_path, team(2)).close()
     shown = page_of(tmp_path)
     assert "svg" not in shown.tags
-    assert "No metrics were recorded." in shown.words
+    assert {"No metrics were recorded.", "No trajectories were recorded."} <= set(shown.words)
+    assert "Nothing was recorded in which one could be seen." in shown.words
+    assert not (tmp_path / "replay.html").exists()
 
 
 def test_too_near_and_worse_than_a_floor_are_marked(tmp_path: Path) -> None:
