@@ -7,15 +7,15 @@ import asyncio
 import faulthandler
 import logging
 import signal
-import sys
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from pathlib import Path
 
 import uvloop
 
-from protocol.errors import BusError, CovreconError, MissionError, SceneError
+from protocol.errors import BusError, CovreconError, MissionError, SceneError, VehicleError
 from protocol.guard import require_own_packages
+from protocol.logs import configure, say_last
 from protocol.mission import Mission
 from protocol.mission_file import load_mission
 
@@ -61,18 +61,22 @@ def parse(role: str, arguments: list[str] | None = None) -> Arguments:
 def run_process(role: str, body: Callable[[Arguments], Coroutine[None, None, None]]) -> int:
     """Run one process's ``body`` to its end or to SIGTERM; its exit code. Stderr's last line says what failed."""
     faulthandler.enable()
-    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     try:
+        configure(role)
         require_own_packages()
         arguments = parse(role)
+        configure(role, arguments.mission.name, arguments.drone)
         # An eighth less CPU a tick than asyncio's own loop, in lockstep where a tick is nothing but messages.
         return uvloop.run(_until_signal(body(arguments)))
     except (MissionError, SceneError, BusError) as error:
-        print(error, file=sys.stderr)
+        say_last(error)
         return BAD_INPUT
+    except VehicleError as error:  # the vehicle's fault: where it was noticed in the program helps nobody
+        say_last(error)
+        return FAILED
     except CovreconError as error:
         log.exception("failed")
-        print(error, file=sys.stderr)
+        say_last(error)
         return FAILED
 
 

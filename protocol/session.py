@@ -82,7 +82,11 @@ async def open_session(endpoint: str, mission: str, *, router: bool, timeout_s: 
         try:
             with errors_of(what):
                 return await asyncio.to_thread(zenoh.open, config)
-        except BusError:
-            if router or loop.time() > deadline:
-                raise
+        except BusError as error:
+            if router:
+                raise BusError(
+                    f"{error}; set transport.endpoint to another, or ask who has it: covrecon doctor MISSION"
+                ) from error
+            if loop.time() > deadline:
+                raise BusError(f"{error}; does the router run? Start it first, with the same endpoint") from error
             await asyncio.sleep(CONNECT_RETRY_S)

@@ -1,0 +1,56 @@
+"""All checks, in the order in which a person would mend what they find."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError
+from pathlib import Path
+
+from deploy.doctor.clock import ClockState, check_clock, read_clock
+from deploy.doctor.finding import Finding
+from deploy.doctor.gpu import check_gpu
+from deploy.doctor.inputs import check_inputs
+from deploy.doctor.libraries import INSTALL, check_libraries, required_libraries
+from deploy.doctor.machine import check_machine
+from deploy.doctor.network import check_network
+from deploy.doctor.ports import check_place, check_socket_folder, places
+from protocol.mission import Mission
+
+
+def examine(mission: Mission, out: Path) -> Iterator[Finding]:
+    """Findings as they come; what takes long, loading the libraries, is last.
+
+    Args:
+        mission: what is to be flown here.
+        out: where run folders are made.
+    """
+    yield Finding("python", "ok", f"{platform.python_version()} on {platform.platform(terse=True)}")
+    yield from check_network(mission)
+    yield from check_inputs(mission)
+    yield check_socket_folder()
+    for place in places(mission):
+        yield check_place(place)
+    yield check_clock(_clock())
+    yield from check_machine(mission, out)
+    yield check_gpu()
+    try:
+        libraries = required_libraries()
+    except PackageNotFoundError:
+        yield Finding("libraries", "fail", "this program is not installed, so what it needs is not known", INSTALL)
+        return
+    yield from check_libraries(libraries, _needed_sets(mission))
+
+
+def _clock() -> ClockState | OSError:
+    try:
+        return read_clock()
+    except OSError as error:
+        return error
+
+
+def _needed_sets(mission: Mission) -> dict[str, str]:
+    needed = {"ground": "the ground station, the simulator and reports need it"}
+    if any(drone.camera for drone in mission.drones):
+        needed["camera"] = "the mission has real cameras"
+    return needed
