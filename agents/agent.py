@@ -17,7 +17,9 @@ from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
+from prometheus_client import CollectorRegistry
 
+from agents.agent_metrics import AgentMetrics
 from agents.cameras.choice import make_feed
 from agents.coverage import CoverageController, Decision
 from agents.homing import Homecoming
@@ -33,8 +35,10 @@ from protocol.clock import clock_of
 from protocol.errors import ProcessError
 from protocol.geometry import Floats
 from protocol.importance import SamplingTerms, compile_kernels
-from protocol.messages import Control, DroneState, JumpHead, MissionPhase, Mode, Tick, Vector5
+from protocol.messages import Control, DroneOrder, DroneState, EventLevel, JumpHead, MissionPhase, Mode, Tick, Vector5
+from protocol.metrics_endpoint import MetricsEndpoint
 from protocol.mission import Mission
+from protocol.news import News
 from protocol.replication import Replication
 from protocol.synchroniser import Synchroniser, blocks_of
 
@@ -77,10 +81,12 @@ class Agent:
         lockstep: bool,
         now_s: Callable[[], float] = time.monotonic,
         watchdog: Callable[..., Guard] = Watchdog,
+        metrics: AgentMetrics | None = None,
     ) -> None:
         """``now_s``: monotonic seconds, callable from any thread, by which silence is judged in real time."""
         self._mission, self._drone, self._bus, self._lockstep = mission, drone, bus, lockstep
         self._now_s = now_s
+        self._metrics = metrics or AgentMetrics(CollectorRegistry())
         starts = {other.id: other.start for other in mission.drones}
         self._wait_ticks = 0 if lockstep else round(mission.replication.wait_s / mission.tick_s)
         self._team = Team(drone, starts, mission.flight, mission.tick_s)
@@ -89,8 +95,10 @@ class Agent:
         self._planner = CoverageController(mission, neighbours=len(starts) - 1)
         self._homecoming = Homecoming(mission, drone, self._planner)
         self._clock = clock_of(mission, bus, lockstep=lockstep, now_s=now_s)
+        self._news = News(bus, topics.EVENT, f"drone/{drone}", drone)
         self._vehicle = make_vehicle(mission, drone, bus, now_s=self._clock.now_s, events=self._note_event)
-        self._orders = Orders(mission, self._clock.now_s)
+        self._orders = Orders(mission, self._clock.now_s, self._news.tell)
+        self._operator = DroneOrder(drone=drone, action="fly", number=0)
         self._feed = make_feed(mission, drone, bus, now_s=self._clock.now_s)
         self._watchdog = watchdog(
             self._vehicle.stop,
@@ -168,7 +176,8 @@ class Agent:
         return authority not in ("starting", "ours", "landing") or self._orders.stays_up
 
     def _note_event(self, level: str, text: str) -> None:
-        log.log(logging.getLevelNamesMapping().get(level.upper(), logging.INFO), "vehicle: %s", text)
+        known: dict[str, EventLevel] = {"warning": "warning", "error": "error", "critical": "error"}
+        self._news.tell(known.get(level.lower(), "info"), "vehicle", text)
 
     def _hear_state(self, state: DroneState) -> None:
         if state.drone != self._drone:
@@ -181,6 +190,9 @@ class Agent:
 
     def _hear_phase(self, order: MissionPhase) -> None:
         self._ground_heard_s = self._now_s()
+        for wanted in order.orders:
+            if wanted.drone == self._drone and wanted.number >= self._operator.number:
+                self._operator = wanted
         if order.phase == "finished":
             self._finished = order.reason
             self._finished_s = min(self._finished_s, self._clock.now_s())
@@ -189,7 +201,7 @@ class Agent:
     # --- one tick ------------------------------------------------------------------------------------------------
 
     async def _step(self, tick: Tick) -> None:
-        self._tick = tick.tick
+        self._tick = self._news.tick = tick.tick
         if self._clock.backlog:  # it is over already: phi catches up with it later, and nothing is decided
             self._earlier.extend((tick.tick, own.pose) for own in tick.vehicles if own.drone == self._drone)
             return
@@ -201,7 +213,7 @@ class Agent:
             self._step_blindly(telemetry, tick, order)
             return
         if self._blind:
-            log.info("tick %d: telemetry is sound again", tick.tick)
+            self._news.tell("info", "vehicle", "telemetry is sound again")
             self._blind = False
         self.mode = mode = self._mode(condition, order)
         self._publish(telemetry, tick.tick, mode)
@@ -209,7 +221,8 @@ class Agent:
             self._feed.note_pose(telemetry.stamp_s, tick.tick, telemetry.pose, telemetry.rotation)
         terms = await self._advance(tick)
         if condition.authority != "ours":
-            self._watchdog.feed()  # nothing is to be sent
+            self._watchdog.feed()  # nothing is to be flown
+            self._vehicle.pass_tick(tick.tick)
             self._homecoming.put_off()
             self._control = None
             if order.action == "land" and condition.authority == "starting":
@@ -229,7 +242,7 @@ class Agent:
     def _step_blindly(self, telemetry: Telemetry | None, tick: Tick, order: Order) -> None:
         """Stop, and say where the vehicle was: the others must not take its silence for flight."""
         if not self._blind:
-            log.error("tick %d: no sound telemetry: braking", tick.tick)
+            self._news.tell("error", "vehicle", "no sound telemetry: braking")
             self._blind = True
         self._homecoming.put_off()
         self._vehicle.stop()
@@ -242,12 +255,13 @@ class Agent:
 
     def _give_orders(self, telemetry: Telemetry | None, condition: Condition) -> Order:
         silence = None if self._lockstep else (self._ground_heard_s, self._now_s())
-        return self._orders.give(telemetry, condition, silence, self._finished)
+        return self._orders.give(telemetry, condition, silence, self._finished, self._operator.action)
 
     def _publish(self, telemetry: Telemetry, tick: int, mode: Mode, blind_s: float = 0.0) -> None:
         state = self._state_of(telemetry, tick, mode, blind_s)
         self._replication.hear_state(state)
         self._bus.put(topics.STATE, state, self._drone)
+        self._metrics.hear(state)
         self._published = tick
         self._landed_told += mode == "landed"
         if not self._lockstep:  # where nothing is lost, nothing need be repeated
@@ -311,6 +325,7 @@ class Agent:
             velocity=tuple(telemetry.velocity.tolist()),
             battery=telemetry.battery,
             mode=mode,
+            obeyed=self._operator.number,
             blind_s=blind_s,
             earlier=tuple(
                 entry for entry in self._earlier if entry[0] > min(self._published, tick - 1 - EARLIER_STATES)
@@ -324,7 +339,7 @@ class Agent:
         if decision.outcome != "solved":
             self._fallbacks += 1
             if self._control is None or self._control.outcome != decision.outcome:
-                log.warning("tick %d: solver says %s: braking until it finds a way", tick, decision.outcome)
+                self._news.tell("warning", "solver", f"{decision.outcome}: braking until it finds a way")
         rows = decision.rows
         self._control = Control(
             tick=tick,
@@ -347,5 +362,7 @@ async def run_agent(mission: Mission, drone: int, endpoint: str, *, lockstep: bo
     """Fly one drone of ``mission`` until it ends."""
     compile_kernels()
     CoverageController(mission, neighbours=1).rehearse()
-    async with connect(endpoint, mission.name, lossless=lockstep) as bus:
-        await Agent(mission, drone, bus, lockstep=lockstep).fly()
+    with MetricsEndpoint(mission, "agent", drone) as served:
+        metrics = AgentMetrics(served.registry)
+        async with connect(endpoint, mission.name, lossless=lockstep) as bus:
+            await Agent(mission, drone, bus, lockstep=lockstep, metrics=metrics).fly()

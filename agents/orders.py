@@ -1,25 +1,24 @@
-"""What the policies are asked and what they said: telemetry and silence become a situation, news becomes a log line."""
+"""What the policies are asked and what they said: telemetry and silence become a situation, new orders are told."""
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable
 
-from agents.policies import Order, Policies, Situation, outside_m
+from agents.policies import Order, Policies, Situation, Wish, outside_m
 from agents.silence import WitnessedSilence
 from agents.vehicles.vehicle import Condition, Telemetry
+from protocol.messages import EventLevel
 from protocol.mission import Mission
-
-log = logging.getLogger(__name__)
+from protocol.news import Tell
 
 
 class Orders:
     """Of one drone; asked every tick."""
 
-    def __init__(self, mission: Mission, now_s: Callable[[], float]) -> None:
-        """``now_s``: the clock of the telemetry's stamps."""
-        self._flight, self._now_s = mission.flight, now_s
+    def __init__(self, mission: Mission, now_s: Callable[[], float], tell: Tell) -> None:
+        """``now_s``: the clock of the telemetry's stamps. ``tell``: who wants to know of new orders."""
+        self._flight, self._now_s, self._tell = mission.flight, now_s, tell
         self._policies = Policies(mission)
         self._telemetry_silence, self._ground_silence = WitnessedSilence(), WitnessedSilence()
         self._starting_since_s = math.inf
@@ -37,9 +36,10 @@ class Orders:
         condition: Condition,
         ground_silent_s: tuple[float, float] | None,
         finished: str,
+        operator: Wish,
     ) -> Order:
         """``ground_silent_s``: when the ground station was heard last, and now; None where its silence does not matter.
-        ``finished``: why the mission is over; empty while it is not."""
+        ``finished``: why the mission is over; empty while it is not. ``operator``: what one ordered last."""
         now_s = self._now_s()
         if condition.authority != "starting":
             self._starting_since_s = now_s
@@ -56,10 +56,11 @@ class Orders:
             gimbal_lost=condition.gimbal_lost,
             ground_away_s=0.0 if ground_silent_s is None else self._ground_silence.look(*ground_silent_s),
             finished=finished,
+            operator=operator,
         )
         order = self._policies.decide(situation)
         if order != self.newest:
-            level = logging.INFO if order.action in ("fly", "wait") else logging.WARNING
-            log.log(level, "%s: %s %s", order.action, order.policy, f"({order.reason})" if order.reason else "")
+            level: EventLevel = "info" if order.action in ("fly", "wait") else "warning"
+            self._tell(level, "order", f"{order.action}: {order.policy}{f' ({order.reason})' if order.reason else ''}")
         self.newest = order
         return order

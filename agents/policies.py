@@ -20,6 +20,7 @@ Action = Literal["fly", "wait", "hold", "return", "land", "yield"]
 """fly: what the planner decides. wait: nothing is sent, the vehicle does not obey yet. hold: zero velocity, keeping
 distance. return: to the start, then land. land: come down here; on the ground: stay there, do not take off. yield:
 nothing is sent and nothing ordered, a pilot flies."""
+Wish = Literal["fly", "hold", "return", "land"]
 SEVERITY: tuple[Action, ...] = ("wait", "hold", "return", "land", "yield")
 """Of what rows order; the later one wins. A drone flies when none does."""
 
@@ -48,6 +49,8 @@ class Situation:
     """Since the ground station was heard last; always 0 in lockstep, which waits instead."""
     finished: str = ""
     """Why the mission is over; empty while it is not."""
+    operator: Wish = "fly"
+    """What an operator ordered last."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +118,16 @@ POLICIES: tuple[Policy, ...] = (
         lasts=True,
     ),
     Policy(
+        "operator: land",
+        'an operator commanded "land" or "abort"',
+        judged=_ON_ITS_WAY,
+        holds=lambda _mission, now: now.operator == "land",
+        action=lambda _mission: "land",
+        then="land here",
+        reason=lambda _now: "commanded",
+        lasts=True,
+    ),
+    Policy(
         "battery critical",
         "share left at or below `vehicles.battery_critical`",
         judged=_ON_ITS_WAY,
@@ -145,6 +158,16 @@ POLICIES: tuple[Policy, ...] = (
         lasts=True,
     ),
     Policy(
+        "operator: return",
+        'an operator commanded "return"',
+        judged=_ON_ITS_WAY,
+        holds=lambda _mission, now: now.operator == "return",
+        action=lambda _mission: "return",
+        then="return to the start and land",
+        reason=lambda _now: "commanded",
+        lasts=True,
+    ),
+    Policy(
         "battery low",
         "share left at or below `vehicles.battery_low`",
         judged=_ON_ITS_WAY,
@@ -172,6 +195,15 @@ POLICIES: tuple[Policy, ...] = (
         action=lambda mission: mission.replication.ground_lost,
         then="hold or land, by `replication.ground_lost`, until it is back",
         reason=lambda now: f"no ground station for {now.ground_away_s:.0f} s",
+    ),
+    Policy(
+        "operator: pause",
+        'an operator commanded "pause"',
+        judged=_ON_ITS_WAY,
+        holds=lambda _mission, now: now.operator == "hold",
+        action=lambda _mission: "hold",
+        then='hold until "resume"; on the ground, do not take off',
+        reason=lambda _now: "commanded",
     ),
     Policy(
         "telemetry stale",

@@ -14,8 +14,14 @@ from typing import Annotated, Literal, NoReturn
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
+from deploy.completion_command import completion_of
+from deploy.doctor_command import doctor
+from deploy.export_command import export_app
+from deploy.recording_command import recording_app
+from deploy.replay_command import replay
 from protocol.errors import CovreconError, MissionError, SceneError
 from protocol.guard import require_own_packages
+from protocol.verbs import Verb
 
 
 def _version() -> str:
@@ -27,10 +33,16 @@ def _version() -> str:
 app = App(
     name="covrecon",
     help="Drones that photograph a scene, map it while flying, and fly on to where the map changes.",
+    help_epilogue="Begin with: covrecon doctor, then covrecon run missions/demo.toml",
     version=_version,
 )
-mission_app = App(name="mission", help="Check and show mission files.")
+mission_app = App(name="mission", help="Check and show mission files. Example: covrecon mission check workshop.toml")
 app.command(mission_app)
+app.command(recording_app)
+app.command(export_app)
+app.command(replay)
+app.command(doctor)
+app.command(completion_of(app), name="completion")
 
 MissionPath = Annotated[Path, Parameter(help="Mission file (TOML).")]
 TeamSize = Annotated[int | None, Parameter(help="Team size; drones that the file does not place start in a grid.")]
@@ -63,9 +75,20 @@ def run(
     restart: Annotated[int, Parameter(validator=Number(gte=0))] = 0,
     vehicles: Annotated[Literal["simulated", "px4", "px4-endpoint"] | None, Parameter(show_default=False)] = None,
     px4_url: Annotated[str | None, Parameter(show_default=False)] = None,
+    console: Annotated[bool, Parameter(negative="", show_default=False)] = False,
+    wait: Annotated[bool, Parameter(negative="", show_default=False)] = False,
+    foxglove: Annotated[int | None, Parameter(show_default=False)] = None,
+    metrics: Annotated[int | None, Parameter(show_default=False)] = None,
     out: Path = Path("runs"),
 ) -> int:
     """Fly a mission: router, simulator, ground station and one process a drone, all on this machine.
+
+    ```
+    covrecon run missions/demo.toml                          # as fast as it goes, the same result each time
+    covrecon run missions/demo.toml --drones 2 --seed 8      # another team, another seed
+    covrecon run my.toml --speed 1 --console --wait          # real time; the page has the start button
+    covrecon run missions/px4.toml --vehicles px4-endpoint   # PX4-like vehicles, started with it
+    ```
 
     Parameters
     ----------
@@ -80,6 +103,14 @@ def run(
         is running already (docs/px4.md); or PX4-like vehicles of our own, started with the run.
     px4_url
         MAVSDK connection of the first PX4; each next one is at the next port.
+    console
+        Serve a page to watch and command the mission; its address, with a token, is printed.
+    wait
+        Stay on the ground until an operator says "start", in the console or by `covrecon command start`.
+    foxglove
+        Port at which Foxglove may watch on this computer, 8765 for example.
+    metrics
+        First port of the Prometheus endpoints on this computer.
     out
         Where the run's folder is made.
     """
@@ -91,16 +122,19 @@ def run(
     from deploy.progress import LiveDisplay, PlainDisplay
     from protocol.mission_file import load_mission
 
-    replaced = {}
-    if vehicles is not None:
-        replaced["kind"] = "simulated" if vehicles == "simulated" else "px4"
-    if px4_url is not None:
-        replaced["url"] = px4_url
-    checked = load_mission(mission, drones=drones, seed=seed, vehicles=replaced)
-    console = Console(highlight=False)
+    chosen = {
+        "vehicles.kind": vehicles and ("simulated" if vehicles == "simulated" else "px4"),
+        "vehicles.url": px4_url,
+        "start": "on_command" if wait else None,
+        "recording.foxglove_port": foxglove,
+        "metrics.port": metrics,
+    }
+    replaced = {name: value for name, value in chosen.items() if value is not None}
+    checked = load_mission(mission, drones=drones, seed=seed, replaced=replaced)
+    terminal = Console(highlight=False)
     display = (
-        LiveDisplay(console, checked)
-        if console.is_terminal and not headless
+        LiveDisplay(terminal, checked)
+        if terminal.is_terminal and not headless
         else PlainDisplay(lambda text: print(text, flush=True))
     )
     return fly(
@@ -111,16 +145,27 @@ def run(
         started=datetime.now(UTC),
         restarts=restart,
         with_autopilots=vehicles == "px4-endpoint",
+        with_console=console,
     )
 
 
 @app.command
-def report(run: Annotated[Path, Parameter(help="A run's folder.")] = Path("runs/latest"), /) -> None:
-    """Write a run's report.html anew, also that of a run which was cut short, and tell what it came to."""
+def report(run: Annotated[Path, Parameter(help="A run's folder, or a recording.")] = Path("runs/latest"), /) -> None:
+    """Write a run's report anew, also that of a run which was cut short, or the report of any recording.
+
+    ```
+    covrecon report                              # of the newest run, runs/latest
+    covrecon report runs/2026-08-01T09-30-00Z
+    covrecon report flight.mcap                  # of a recording alone
+    ```
+    """
     from deploy.outcome import SUMMARY_FILE, describe, read_outcome
     from ground_station.report import write_report
 
     page = write_report(run.resolve())
+    if run.is_file():
+        print(f"report: {page}")
+        return
     if (page.parent / SUMMARY_FILE).exists():
         for line in describe(read_outcome(page.parent), page.parent):
             print(line)
@@ -128,9 +173,40 @@ def report(run: Annotated[Path, Parameter(help="A run's folder.")] = Path("runs/
         print(f"the run was cut short; report: {page}")
 
 
+@app.command
+def command(
+    verb: Verb,
+    /,
+    *,
+    drone: Annotated[tuple[int, ...], Parameter(help="Only this one; may be repeated. All without.")] = (),
+    run: Annotated[Path, Parameter(help="The folder of the run that flies.")] = Path("runs/latest"),
+    patience: Annotated[float, Parameter(help="Seconds to wait for all acknowledgements.")] = 10.0,
+) -> None:
+    """Command a mission that flies, and wait until every drone has acknowledged it.
+
+    start: a mission that waits for it (`covrecon run --wait`). pause, resume: hold the place, go on. return: fly to the
+    start and land. land: come down here. abort: all land, and the mission ends.
+
+    ```
+    covrecon command pause
+    covrecon command land --drone 3
+    covrecon command return --drone 1 --drone 4 --run runs/2026-08-01T09-30-00Z
+    ```
+    """
+    import asyncio
+
+    from deploy.command_client import command as insist
+    from deploy.command_client import place_of
+
+    asyncio.run(insist(place_of(run), verb, drone, say=print, patience_s=patience))
+
+
 @mission_app.command
 def check(mission: MissionPath, /, *, drones: TeamSize = None) -> None:
-    """Say all that is wrong with a mission file."""
+    """Say all that is wrong with a mission file, each fault with its line.
+
+    Example: covrecon mission check workshop.toml --drones 4
+    """
     from protocol.mission_file import load_mission
 
     checked = load_mission(mission, drones=drones)
@@ -139,7 +215,10 @@ def check(mission: MissionPath, /, *, drones: TeamSize = None) -> None:
 
 @mission_app.command
 def show(mission: MissionPath, /, *, drones: TeamSize = None, seed: Seed = None) -> None:
-    """Print the effective mission, every default spelt out, as a mission file."""
+    """Print the effective mission, every default spelt out, as a mission file.
+
+    Example: covrecon mission show missions/demo.toml --drones 6 > six.toml
+    """
     from protocol.mission_file import load_mission, mission_to_toml
 
     print(mission_to_toml(load_mission(mission, drones=drones, seed=seed)), end="")
@@ -147,7 +226,10 @@ def show(mission: MissionPath, /, *, drones: TeamSize = None, seed: Seed = None)
 
 @mission_app.command
 def schema() -> None:
-    """Print the JSON schema of mission files, for editors."""
+    """Print the JSON schema of mission files, for editors.
+
+    Example: covrecon mission schema > mission.schema.json
+    """
     from protocol.mission_file import mission_schema
 
     print(mission_schema(), end="")
@@ -169,6 +251,7 @@ def _process(command: str, module: str, what: str) -> None:
 
 
 _process("agent", "agents", "one drone")
+_process("console", "ground_station.console", "the page in the browser")
 _process("ground", "ground_station", "the ground station")
 _process("router", "protocol.router", "the router")
 _process("sim", "sim_bridge", "the simulator")

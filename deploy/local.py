@@ -39,9 +39,9 @@ LOG_BYTES = 16 * 1024
 BAD_INPUT = 2
 """Exit code of a process that refuses its mission, scene or endpoint; any other failure is 1."""
 
-Kind = Literal["router", "ground", "sim", "observer", "autopilots", "agent"]
+Kind = Literal["router", "ground", "sim", "observer", "autopilots", "agent", "console"]
 """sim and autopilots carry vehicles, an observer only watches them."""
-SERVANTS: tuple[Kind, ...] = ("router", "autopilots")
+SERVANTS: tuple[Kind, ...] = ("router", "autopilots", "console")
 """Serve until the others are gone, and go with the group."""
 
 
@@ -65,11 +65,19 @@ def environment(outer: Mapping[str, str]) -> dict[str, str]:
 
 
 def mission_roles(
-    run: Path, endpoint: str, drones: Sequence[int], speed: str, *, px4: bool = False, autopilots: bool = False
+    run: Path,
+    endpoint: str,
+    drones: Sequence[int],
+    speed: str,
+    *,
+    px4: bool = False,
+    autopilots: bool = False,
+    console: bool = False,
 ) -> list[Role]:
     """Router, simulator, ground station and one agent a drone; all read ``mission.json`` in the run folder.
 
-    ``px4``: the vehicles are not the simulator's. ``autopilots``: they are PX4-like ones of our own.
+    ``px4``: the vehicles are not the simulator's. ``autopilots``: they are PX4-like ones of our own. ``console``: with
+    the page in the browser.
     """
 
     def role(name: str, kind: Kind, module: str, *more: str) -> Role:
@@ -82,6 +90,7 @@ def mission_roles(
         *([role("autopilots", "autopilots", "sim_bridge.px4_endpoint")] if autopilots else []),
         role("sim", "observer" if px4 else "sim", "sim_bridge"),
         role("ground", "ground", "ground_station"),
+        *([role("console", "console", "ground_station.console")] if console else []),
         *(role(f"drone-{drone}", "agent", "agents", "--drone", str(drone)) for drone in drones),
     ]
 
@@ -165,7 +174,7 @@ class _Run:
         else:
             self._say(_obituary(role, code, self._logs))
             self._result = self._result or (BAD_INPUT if code == BAD_INPUT else 1)
-            self._hopeless |= role.kind not in ("agent", "observer")
+            self._hopeless |= role.kind not in ("agent", "observer", "console")
 
     def _may_start_again(self, role: Role, code: int) -> bool:
         mortal = role.kind not in ("sim", "autopilots") and code != BAD_INPUT and not self._over

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import suppress
+import json
 from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,6 +21,8 @@ from protocol.mission import Mission
 
 Speed = Literal["max", "1"]
 
+CONSOLE_FILE, CONSOLE_POLL_S = "console.json", 0.3
+"""Where the console leaves its address, and how often it is looked for, wall time."""
 LANDING_S = 180.0
 """What drones in the air get to come home and down once the ground station is done."""
 
@@ -34,11 +36,12 @@ def fly(
     started: datetime,
     restarts: int = 0,
     with_autopilots: bool = False,
+    with_console: bool = False,
 ) -> int:
     """Run ``mission`` on this machine and say how it went; the exit code of the command.
 
     A process that dies is started again up to ``restarts`` times, the simulator of vehicles excepted.
-    ``with_autopilots``: also start PX4-like vehicles of our own.
+    ``with_autopilots``: also start PX4-like vehicles of our own. ``with_console``: and the page in the browser.
     """
     with TemporaryDirectory(prefix="covrecon-", dir=socket_folder_parent(), ignore_cleanup_errors=True) as private:
         endpoint = mission.transport.endpoint or socket_endpoint(Path(private))
@@ -50,6 +53,7 @@ def fly(
             speed,
             px4=mission.vehicles.kind == "px4",
             autopilots=with_autopilots,
+            console=with_console,
         )
         with display:
             compile_everything(mission)
@@ -58,11 +62,11 @@ def fly(
     try:
         for line in describe(read_outcome(run), run):
             display.say(line)
-    except ProcessError as error:
+    except ProcessError:
         if result == 0:
             raise
         # A run that ended early said why already.
-        display.say(f"no result: {error}")
+        display.say(f"no result; what was kept: {run}; what it came to by then: covrecon report {run}")
     return result
 
 
@@ -77,10 +81,21 @@ def compile_everything(mission: Mission) -> None:
     rehearse(mission)
 
 
+async def _say_where_the_console_is(run: Path, display: Display) -> None:
+    """Once it serves; without one, never."""
+    file = run / CONSOLE_FILE
+    while not file.exists():  # noqa: ASYNC110  # another process makes it
+        await asyncio.sleep(CONSOLE_POLL_S)
+    display.say(f"console: {json.loads(file.read_bytes())['url']}")
+
+
 async def _supervise_and_show(
     roles: list[Role], run: Path, private: Path, endpoint: str, mission: Mission, display: Display, restarts: int
 ) -> int:
-    watching = asyncio.create_task(follow(endpoint, mission, display))
+    watching = [
+        asyncio.create_task(watch)
+        for watch in (follow(endpoint, mission, display), _say_where_the_console_is(run, display))
+    ]
     try:
         return await supervise(
             roles,
@@ -91,6 +106,6 @@ async def _supervise_and_show(
             settle_s=LANDING_S if mission.vehicles.kind == "px4" else SETTLE_S,
         )
     finally:
-        watching.cancel()
-        with suppress(asyncio.CancelledError):
-            await watching
+        for watch in watching:
+            watch.cancel()
+        await asyncio.gather(*watching, return_exceptions=True)

@@ -111,7 +111,7 @@ def _read(path: Path, mission: Mission) -> Checkpoint:
     first, *spans = layout.contents
     description = json.loads(data[first.first : first.last])
     if description["mission"] != _sha256(mission):
-        raise MissionError([f"{path}: is of another mission"])
+        raise MissionError([f"{path}: is of another mission; take a new run folder: --run FOLDER"])
     arrays: dict[str, NDArray[Any]] = {}
     for (name, (dtype, shape)), span in zip(description["arrays"].items(), spans, strict=True):
         arrays[name] = np.frombuffer(data, dtype, math.prod(shape), span.first).reshape(shape).copy()

@@ -59,8 +59,8 @@ class JumpPublisher:
         for encoded in self._journal.page(self._journal.first_sequence, self._journal.next_sequence, NO_LIMIT):
             self._replication.hear_jump(decode(Jump, encoded))
 
-    async def publish(self, increments: NDArray[np.float32], tick: int) -> None:
-        """A jump of ``increments`` (positions,) that takes effect at ``tick``.
+    async def publish(self, increments: NDArray[np.float32], tick: int) -> Jump | None:
+        """A jump of ``increments`` (positions,) that takes effect at ``tick``; the jump as it was told.
 
         What the disk refuses is not told to anybody; it is added to the next jump.
         """
@@ -73,10 +73,11 @@ class JumpPublisher:
             self.unwritten += 1
             self._refused = increments
             log.error("jump %d is held back: %s", jump.sequence, error)  # noqa: TRY400  # the disk's fault, not ours
-            return
+            return None
         self._refused = None
         self._bus.put_encoded(topics.JUMP, encoded)
         self._replication.hear_jump(jump)
+        return jump
 
     async def compact(self, below: int, limit_bytes: float) -> None:
         """Remove the jumps below that number once the journal is larger than ``limit_bytes``."""

@@ -18,6 +18,9 @@ from ground_station.evaluation import Scores
 from ground_station.feedback import FeedbackSchedule
 from ground_station.jump_publisher import JumpPublisher
 from ground_station.mapper import Mapper, MapUpdate
+from ground_station.reconstruction.reconstructor import Mesh
+from ground_station.recording.recorder import Recorder
+from protocol import topics
 from protocol.messages import Keyframe
 from protocol.mission import Mission
 
@@ -35,14 +38,18 @@ KEYFRAME_BACKLOG = 200
 class _Update:
     """A map update that is being computed."""
 
+    tick: int
     effective: int
     importance: float
     task: asyncio.Task[MapUpdate]
 
 
 class MapFeedback:
-    def __init__(self, mission: Mission, mapper: Mapper, jumps: JumpPublisher, *, lockstep: bool) -> None:
+    def __init__(
+        self, mission: Mission, mapper: Mapper, jumps: JumpPublisher, recorder: Recorder, *, lockstep: bool
+    ) -> None:
         self._mission, self._mapper, self._jumps, self._lockstep = mission, mapper, jumps, lockstep
+        self._recorder = recorder
         self._schedule = FeedbackSchedule(mission.feedback, mission.tick_s)
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="mapper")
         self._adding: set[asyncio.Task[None]] = set()
@@ -57,6 +64,8 @@ class MapFeedback:
         self.dropped = 0
         """Keyframes that were lost on the way or for which there was no time."""
         self.scores: Scores | None = None
+        self.mesh: Mesh | None = None
+        """The newest."""
 
     @property
     def backlog(self) -> int:
@@ -79,6 +88,7 @@ class MapFeedback:
     def hear(self, keyframe: Keyframe) -> None:
         """Also notices those before it that never came."""
         self.received += 1
+        self._recorder.heard(topics.KEYFRAME, keyframe, keyframe.tick)
         newest = self._newest.get(keyframe.drone, keyframe.sequence - 1)
         if keyframe.sequence < newest:  # counted as lost when a later one came first
             self.dropped = max(0, self.dropped - 1)
@@ -100,6 +110,7 @@ class MapFeedback:
             self.dropped += len(ready)
             return
         self.handed += len(ready)
+        self._recorder.handed_over(tick, ready)
         task = asyncio.create_task(self._add(ready))
         self._adding.add(task)
         task.add_done_callback(self._adding.discard)
@@ -120,8 +131,9 @@ class MapFeedback:
         scored = time_s - self._scored_at >= SCORE_PERIOD_S
         if scored:
             self._scored_at = time_s
+        self._recorder.looked(tick, importance)
         task = asyncio.create_task(self.on_worker(lambda: self._mapper.update(scored=scored)))
-        self._updates.append(_Update(self._schedule.effective_tick(tick), importance, task))
+        self._updates.append(_Update(tick, self._schedule.effective_tick(tick), importance, task))
 
     async def settle(self, tick: int) -> None:
         """Turn finished updates into jumps.
@@ -136,10 +148,14 @@ class MapFeedback:
             result = await update.task
             self._updates.popleft()
             self.scores = result.scores or self.scores
+            self.mesh = result.mesh
+            self._recorder.mesh(update.tick, result.mesh)
             increments = self._schedule.increments(result.change, update.importance)
             if increments is not None:
                 effective = update.effective if self._lockstep else max(update.effective, tick + LEAD_TICKS)
-                await self._jumps.publish(increments, effective)
+                jump = await self._jumps.publish(increments, effective)
+                if jump is not None:
+                    self._recorder.jumped(update.tick, jump, tick)
 
     def settled_until(self, tick: int) -> int:
         """The last tick for which no further jump can come, said at ``tick``; at least ``tick`` + 1 in lockstep."""
@@ -158,6 +174,7 @@ class MapFeedback:
             await asyncio.wait(self._adding)
         result = await self.on_worker(self._mapper.finish)
         self.scores = result.scores or self.scores
+        self.mesh = result.mesh
         return result
 
     def close(self) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ground_station.mesh_blocks import MeshBlocks
 from ground_station.reconstruction.backends import make_reconstructor
 from ground_station.reconstruction.reconstructor import Keyframe
 from protocol.geometry import camera_rotation
@@ -53,5 +54,5 @@ def rehearse(mission: Mission) -> int:
             ]
         )
     reconstructor.flush()
-    reconstructor.mesh()
+    MeshBlocks().update(reconstructor.mesh())
     return reconstructor.statistics().fused

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 
 from ground_station.results import Metrics
 from ground_station.separation import nearest_distances
-from protocol.messages import Control, DroneState, DroneStatus, Phase, ReplicaState, Status
+from protocol.messages import DroneState, DroneStatus, Phase, ReplicaState, Status
 from protocol.mission import Mission
-
-log = logging.getLogger(__name__)
-
+from protocol.news import Tell
 
 UNKNOWN = 2**62
 
 
 class StatusBoard:
-    def __init__(self, mission: Mission) -> None:
-        self._mission = mission
+    def __init__(self, mission: Mission, tell: Tell) -> None:
+        """``tell``: who wants to know of those who come and go."""
+        self._mission, self._tell = mission, tell
         self._newest: dict[int, DroneState] = {}
         self._lives: AbstractSet[str] = frozenset()
         self._separation = math.inf
@@ -34,6 +32,12 @@ class StatusBoard:
         known = self._newest.get(state.drone)
         if known is None or known.tick <= state.tick:
             self._newest[state.drone] = state
+
+    @property
+    def all_landed(self) -> bool:
+        """Whether no drone of the mission will fly any more."""
+        states = [self._newest.get(drone.id) for drone in self._mission.drones]
+        return all(state is not None and state.mode == "landed" for state in states)
 
     def all_lack_phi(self, drones: Iterable[int]) -> bool:
         """Whether each of ``drones``, at least one, says that its phi is not complete."""
@@ -50,19 +54,18 @@ class StatusBoard:
         if alive == self._lives:
             return
         for role in sorted(self._lives - alive):
-            log.warning("%s is gone", role)
+            self._tell("warning", "link", f"{role} is gone")
         for role in sorted(alive - self._lives):
-            log.info("%s is there", role)
+            self._tell("info", "link", f"{role} is there")
         self._lives = frozenset(alive)
 
     def note_poses(self, poses: Mapping[int, Sequence[float]]) -> None:
         self._nearest = nearest_distances(poses)
         self._separation = min(self._separation, *self._nearest.values(), math.inf)
 
-    def controls(self, drones: Iterable[int]) -> dict[int, Control]:
-        """The newest decision of each of ``drones`` that has told one."""
-        states = ((drone, self._newest.get(drone)) for drone in drones)
-        return {drone: state.control for drone, state in states if state is not None and state.control is not None}
+    def states(self, drones: Iterable[int]) -> dict[int, DroneState]:
+        """The newest of each of ``drones`` that was heard."""
+        return {drone: self._newest[drone] for drone in drones if drone in self._newest}
 
     def wall_s(self, now_s: float) -> float:
         """Wall time since the first status after take-off."""
@@ -83,7 +86,7 @@ class StatusBoard:
         now_s: float,
     ) -> Status:
         """``now_s``: monotonic wall time, for rates."""
-        if self._began_s is None and phase != "starting":
+        if self._began_s is None and phase not in ("waiting", "starting"):
             self._began_s = now_s
         rate = 0.0
         if self._before is not None and now_s > self._before[0]:
@@ -111,6 +114,8 @@ class StatusBoard:
         )
 
     def _describe(self, phase: Phase, metrics: Metrics, backlog: int, alive: AbstractSet[str]) -> str:
+        if phase == "waiting":
+            return "waiting for an operator's start"
         if phase == "starting":
             expected = ["sim", *(f"drone/{drone.id}" for drone in self._mission.drones)]
             missing = [role for role in expected if role not in alive]

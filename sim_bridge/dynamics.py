@@ -11,6 +11,8 @@ from numba import njit
 from protocol.geometry import Floats
 from protocol.mission import Flight
 
+DOWN_M = 0.05
+"""Height below which a vehicle that lands stands on the ground."""
 LANDING_MPS = 0.3
 """Descent of a vehicle that lands, down to z = 0."""
 
@@ -25,6 +27,11 @@ class VehicleBody:
     commanded_at_s: float
     landing: bool = False
     """Whether it comes down or stands on the ground: commands no longer matter."""
+
+    @property
+    def is_down(self) -> bool:
+        """Whether it stands on the ground, for good."""
+        return self.landing and bool(self.pose[2] < DOWN_M)
 
     @classmethod
     def at(cls, start: Floats) -> VehicleBody:

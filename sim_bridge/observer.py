@@ -16,10 +16,10 @@ import numpy as np
 from protocol import topics
 from protocol.bus import Bus
 from protocol.geometry import Floats
-from protocol.messages import DroneState, JumpHead, Mode, Tick
+from protocol.messages import DroneState, Mode, Tick
 from protocol.mission import Mission
 from sim_bridge.darkroom import Darkroom
-from sim_bridge.roll_call import wait_for_everybody
+from sim_bridge.roll_call import MissionWatch, wait_for_everybody
 
 if TYPE_CHECKING:
     from sim_bridge.photographer import Photographer
@@ -37,20 +37,16 @@ class Observer:
         self._mission, self._bus = mission, bus
         self._darkroom = Darkroom(bus, photographer)
         self._states: dict[int, DroneState] = {}
-        self._head = JumpHead(epoch=0, next_sequence=0, done=0, phase="starting")
+        self._watch = MissionWatch(bus, mission)
         self._rendered = {drone.id for drone in mission.drones if not drone.camera}
         self._tick = 0
         bus.on(topics.STATE, self._hear_state)
-        bus.on(topics.HEAD, self._hear_head)
         bus.watch_lives()
 
     def _hear_state(self, state: DroneState) -> None:
         known = self._states.get(state.drone)
         if known is None or known.tick <= state.tick:
             self._states[state.drone] = state
-
-    def _hear_head(self, head: JumpHead) -> None:
-        self._head = head
 
     async def run(self) -> None:
         """Until the mission is over and no drone is in the air any more.
@@ -65,6 +61,7 @@ class Observer:
             log.info("joining at tick %d", self._tick)
         else:
             await wait_for_everybody(self._bus, self._mission)
+            await self._watch.wait_for_start()
         loop = asyncio.get_running_loop()
         began, first = loop.time(), self._tick
         try:
@@ -79,7 +76,7 @@ class Observer:
     def _is_over(self) -> bool:
         gone = not any(role.startswith("drone/") for role in self._bus.alive)
         down = all(state.mode == "landed" for state in self._states.values() if self._is_fresh(state))
-        return self._head.phase == "finished" and (gone or down)
+        return self._watch.is_over and (gone or down)
 
     def _is_fresh(self, state: DroneState) -> bool:
         return (self._tick - state.tick) * self._mission.tick_s <= topics.STATE.max_age_s
@@ -95,8 +92,8 @@ class Observer:
             lockstep=False,
             live=tuple(sorted(drone.id for drone in self._mission.drones if self._is_live(drone.id))),
             vehicles=(),
-            jump_epoch=self._head.epoch,
-            next_jump=self._head.next_sequence,
+            jump_epoch=self._watch.head.epoch,
+            next_jump=self._watch.head.next_sequence,
             keyframes=self._darkroom.sent,
         )
 

@@ -18,12 +18,13 @@ import numpy as np
 from protocol import topics
 from protocol.bus import Bus, connect
 from protocol.errors import ProcessError
-from protocol.messages import JumpHead, Setpoint, Tick, VehicleSample
+from protocol.messages import Setpoint, Tick, VehicleSample
+from protocol.metrics_endpoint import MetricsEndpoint
 from protocol.mission import Mission
 from sim_bridge.darkroom import Darkroom
 from sim_bridge.dynamics import VehicleBody
 from sim_bridge.observer import Observer
-from sim_bridge.roll_call import wait_for_everybody
+from sim_bridge.roll_call import MissionWatch, wait_for_everybody
 
 if TYPE_CHECKING:
     from sim_bridge.photographer import Photographer
@@ -35,6 +36,8 @@ LOCKSTEP_PATIENCE_S = 60.0
 GROUND_PATIENCE_S = 120.0
 """How long the world goes on without a ground station that could end the mission, beyond what the mission allows; in
 lockstep, how long it stands still."""
+END_PATIENCE_S = 2.0
+"""Drones that ended may have heard of the mission's end before this process does."""
 CHECK_S = 0.5
 """How often a tick is said again while the world stands still, for whoever has just come."""
 
@@ -46,12 +49,11 @@ class Simulator:
         self._bodies = {drone.id: VehicleBody.at(np.array(drone.start)) for drone in mission.drones}
         self._flown = dict.fromkeys(self._bodies, -1)
         self._silent: set[int] = set()
-        self._head = JumpHead(epoch=0, next_sequence=0, done=0, phase="starting")
+        self._watch = MissionWatch(bus, mission)
         self._tick = 0
         self._beaten: Tick
         self._ground_seen_s = 0.0
         bus.on(topics.SETPOINT, self._hear_setpoint)
-        bus.on(topics.HEAD, self._hear_head)
         bus.watch_lives()
 
     def _hear_setpoint(self, setpoint: Setpoint) -> None:
@@ -65,9 +67,6 @@ class Simulator:
         self._flown[setpoint.drone] = tick
         self._silent.discard(setpoint.drone)
 
-    def _hear_head(self, head: JumpHead) -> None:
-        self._head = head
-
     async def run(self) -> None:
         """Until the ground station says that the mission is finished.
 
@@ -76,10 +75,11 @@ class Simulator:
         """
         self._bus.announce("sim")
         await wait_for_everybody(self._bus, self._mission)
+        await self._watch.wait_for_start()
         loop = asyncio.get_running_loop()
         began = loop.time()
         try:
-            while self._head.phase != "finished":
+            while not self._watch.is_over:
                 self._publish(self._beat())
                 poses = {drone: body.pose for drone, body in self._bodies.items()}
                 await self._darkroom.photograph(self._tick, poses, wait=self._lockstep)
@@ -99,7 +99,8 @@ class Simulator:
         return [drone for drone in sorted(self._bodies) if self._is_live(drone)]
 
     def _is_live(self, drone: int) -> bool:
-        return drone not in self._silent and f"drone/{drone}" in self._bus.alive
+        here = drone not in self._silent and f"drone/{drone}" in self._bus.alive
+        return here and not self._bodies[drone].is_down
 
     def _beat(self) -> Tick:
         if not self._lockstep:
@@ -121,8 +122,8 @@ class Simulator:
             lockstep=self._lockstep,
             live=tuple(self._live()),
             vehicles=tuple(vehicles),
-            jump_epoch=self._head.epoch,
-            next_jump=self._head.next_sequence,
+            jump_epoch=self._watch.head.epoch,
+            next_jump=self._watch.head.next_sequence,
             keyframes=self._darkroom.sent,
         )
 
@@ -149,12 +150,14 @@ class Simulator:
             late = {drone for drone in self._live() if self._flown[drone] < tick}
             log.error("tick %d: no answer from drones %s: going on without them", tick, sorted(late))
             self._silent |= late
-        if not self._live():
+        if self._live() or any(body.is_down for body in self._bodies.values()):
+            return
+        if not await self._bus.until(lambda: self._watch.is_over, END_PATIENCE_S):
             raise ProcessError(f"tick {tick}: no drone answers")
 
     async def _wait_for_ground(self) -> None:
         def done() -> bool:
-            return self._head.done > self._tick or self._head.phase == "finished"
+            return self._watch.head.done > self._tick or self._watch.is_over
 
         if not await self._stand_still(done, GROUND_PATIENCE_S):
             raise ProcessError(f"tick {self._tick}: the ground station is not done after {GROUND_PATIENCE_S:g} s")
@@ -171,11 +174,12 @@ async def run_simulator(mission: Mission, endpoint: str, run: Path, *, lockstep:
     """Simulate the world of ``mission``, or what its cameras see where autopilots fly; what is true of it is left in
     the run folder."""
     photographer = await asyncio.to_thread(_make_photographer, mission, run)
-    async with connect(endpoint, mission.name, lossless=lockstep) as bus:
-        if mission.vehicles.kind == "px4":
-            await Observer(mission, bus, photographer).run()
-        else:
-            await Simulator(mission, bus, photographer, lockstep=lockstep).run()
+    with MetricsEndpoint(mission, "sim"):
+        async with connect(endpoint, mission.name, lossless=lockstep) as bus:
+            if mission.vehicles.kind == "px4":
+                await Observer(mission, bus, photographer).run()
+            else:
+                await Simulator(mission, bus, photographer, lockstep=lockstep).run()
 
 
 def _make_photographer(mission: Mission, run: Path) -> Photographer | None:

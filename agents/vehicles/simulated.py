@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -13,6 +14,9 @@ from protocol.geometry import Floats
 from protocol.messages import Setpoint, Tick
 from protocol.mission import Flight
 
+DOWN_M = 0.05
+"""Below this height a vehicle that was told to land stands on the ground."""
+
 
 class SimulatedVehicle:
     def __init__(self, bus: Bus, drone: int, flight: Flight, tick_s: float, now_s: Callable[[], float]) -> None:
@@ -22,6 +26,7 @@ class SimulatedVehicle:
         self._telemetry: Telemetry | None = None
         self._tick = 0
         self._first_sent: int | None = None
+        self._landing = False
         bus.on(topics.TICK, self._hear)
 
     def _hear(self, tick: Tick) -> None:
@@ -49,7 +54,10 @@ class SimulatedVehicle:
         """Nothing, likewise."""
 
     def condition(self) -> Condition:
-        return Condition("ours")
+        if not self._landing:
+            return Condition("ours")
+        height_m = math.inf if self._telemetry is None else float(self._telemetry.pose[2])
+        return Condition("landed" if height_m < DOWN_M else "landing")
 
     def telemetry(self) -> Telemetry | None:
         return self._telemetry
@@ -62,6 +70,9 @@ class SimulatedVehicle:
         self._bus.put(topics.SETPOINT, setpoint, self._drone)
         return sent
 
+    def pass_tick(self, tick: int) -> None:
+        self.send(tick, np.zeros(5))
+
     def stop(self) -> None:
         self.send(self._tick, np.zeros(5))
 
@@ -69,6 +80,7 @@ class SimulatedVehicle:
         self.stop()
 
     def land(self) -> None:
+        self._landing = True
         setpoint = Setpoint(drone=self._drone, tick=self._tick, velocity=(0.0,) * 5, land=True)
         self._bus.put(topics.SETPOINT, setpoint, self._drone)
 

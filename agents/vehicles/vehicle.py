@@ -67,6 +67,10 @@ class Vehicle(Protocol):
         """Fly ``velocity`` (5,) from ``tick`` on; returns what was really sent after clipping."""
         ...
 
+    def pass_tick(self, tick: int) -> None:
+        """Nothing is sent for ``tick``, because the vehicle does not fly for us: tell whoever waits for a command."""
+        ...
+
     def stop(self) -> None:
         """Zero velocity now, whatever was sent before."""
         ...

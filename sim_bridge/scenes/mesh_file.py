@@ -36,7 +36,10 @@ def find_mesh(spec: str, relative_to: Path) -> Path:
             raise SceneError(f"{path}: a scene folder holds exactly one of {', '.join(SUFFIXES)}; found {names}")
         return found[0]
     if not path.exists():
-        raise SceneError(f"{path}: no such scene: neither a built-in name nor a file or folder")
+        raise SceneError(
+            f"{path}: no such scene: neither a built-in name (living_room) nor a file or folder; "
+            "simulation.scene is relative to the mission file"
+        )
     if path.suffix.lower() not in SUFFIXES:
         raise SceneError(f"{path}: not a mesh that can be read; known are {', '.join(SUFFIXES)}")
     return path

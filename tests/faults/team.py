@@ -24,9 +24,11 @@ from faults.network import Network
 from faults.scripted_mapper import ScriptedMapper
 from faults.session import Ring, Session
 from faults.virtual_loop import Process
+from ground_station.command_log import COMMANDS_FILE, CommandLog
 from ground_station.ground_station import GroundStation
 from ground_station.journal import JOURNAL_FILE, open_journal
 from ground_station.mapper import Mapper
+from ground_station.recording.recorder import Recorder
 from ground_station.results import RunFolder
 from protocol import topics
 from protocol.bus import Bus
@@ -129,13 +131,16 @@ class Team:
 
     async def _fly_ground(self, member: Member, bus: Bus) -> None:
         run = RunFolder(self._folder, self.mission)
+        recorder = Recorder(None, self.mission, lossless=self.lockstep)
+        commands = CommandLog(self._folder / COMMANDS_FILE)
         try:
             journal = open_journal(self._folder / JOURNAL_FILE)
             mapper = cast("Mapper", ScriptedMapper(self.field, self._seed))
-            ground = GroundStation(self.mission, bus, run, journal, mapper, lockstep=self.lockstep)
+            ground = GroundStation(self.mission, bus, run, journal, commands, mapper, recorder, lockstep=self.lockstep)
             member.shell = ground
             await ground.run()
         finally:
+            commands.close()
             run.close()
 
     # --- faults --------------------------------------------------------------------------------------------------

@@ -88,9 +88,10 @@ def test_drones_land_and_stay_on_the_ground(tmp_path: Path) -> None:
         assert modes(team) == {"landing"}
         await asyncio.sleep(15.0)
         assert bodies(team)[:, 2] == pytest.approx(0.0, abs=0.03)
+        assert modes(team) == {"landed"}
         team.start("ground")
         await asyncio.sleep(4.0)
-        assert modes(team) == {"landing"}
+        assert modes(team) == {"landed"}
         assert bodies(team)[:, 2] == pytest.approx(0.0, abs=0.03)
 
     in_virtual_time("land", tmp_path, then)

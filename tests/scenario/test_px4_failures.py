@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import signal
 import time
 from pathlib import Path
@@ -10,7 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from deploy.command_client import Place, command
 from faults.px4_flight import HOME_M, PATIENCE_S, FlownDrone, px4_flight, px4_mission
+from protocol.errors import CommandError
+from protocol.verbs import Verb
 from sim_bridge.px4_endpoint.endpoint import Endpoint
 
 pytestmark = [pytest.mark.processes, pytest.mark.timeout(300)]
@@ -151,6 +155,48 @@ async def one_that_refuses_offboard_says_so(refusing: FlownDrone) -> None:
     await refusing.until_said("Switching to Offboard is currently not available")
     assert refusing.said(r"wait: not ours yet \(")
     await refusing.until(lambda: refusing.vehicle.mode.name == "HOLD", "to hold after its take-off")
+
+
+# --- an operator ------------------------------------------------------------------------------------------------------
+
+
+async def test_an_operator_pauses_returns_and_lands_drones(tmp_path: Path) -> None:
+    """operator: pause, operator: return, operator: land; and a ground station that is killed in between."""
+    async with px4_flight(px4_mission(tmp_path, 3), tmp_path) as flight:
+        returning, landing, other = flight.drones.values()
+        place = Place(flight.processes.endpoint, flight.processes.mission.name)
+
+        async def order(verb: Verb, *drones: FlownDrone) -> None:
+            await command(place, verb, [drone.id for drone in drones], say=lambda _: None, patience_s=PATIENCE_S)
+
+        for drone in flight.drones.values():
+            await drone.until_on_its_way()
+        await order("pause")
+        for drone in flight.drones.values():
+            await drone.until_said(r"hold: operator: pause \(commanded\)")
+            await drone.until(lambda drone=drone: drone.is_ours and drone.speed < 0.1, "to hold")  # type: ignore[misc]
+        marked = {drone.id: len(drone.log) for drone in flight.drones.values()}
+        await order("resume")
+        for drone in flight.drones.values():
+            await drone.until_said("fly: as planned", after=marked[drone.id])
+        await order("return", returning)
+        await order("land", landing)
+        await flight.processes.kill("ground")
+        flight.processes.start("ground")
+        await other.until_it_moves_on()
+        with pytest.raises(CommandError, match=f"nothing to pause: drone {landing.id} lands already"):
+            await order("pause", landing)
+        await landing.until_said(r"land: operator: land \(commanded\)")
+        await landing.until_down()
+        await returning.until_said(r"return: operator: return \(commanded\)")
+        await returning.until_down()
+        assert returning.home_m < HOME_M
+        await order("abort")
+        await other.until_down()
+        await flight.until(lambda: flight.processes.code("ground") == 0, "the ground station to end")
+        summary = json.loads((flight.processes.run / "summary.json").read_bytes())
+        assert summary["exit_reason"] == "aborted by an operator"
+        flight.judge({})
 
 
 # --- processes and links ----------------------------------------------------------------------------------------------

@@ -42,12 +42,15 @@ BIT = 1e-6
 
 IN_FLIGHT: dict[str, tuple[dict[str, Any], dict[str, Any], Action]] = {
     "telemetry lost": ({"telemetry_age_s": 3.0 + BIT}, {"telemetry_age_s": 0.5}, "land"),
+    "operator: land": ({"operator": "land"}, {"operator": "fly"}, "land"),
     "battery critical": ({"battery": 0.1}, {"battery": 0.25 + BIT}, "land"),
     "geofence": ({"outside_m": 0.5 + BIT}, {"outside_m": 0.5}, "land"),
     "mission end": ({"finished": "J fell below 0.5"}, {"finished": ""}, "return"),
+    "operator: return": ({"operator": "return"}, {"operator": "fly"}, "return"),
     "battery low": ({"battery": 0.25}, {"battery": 0.25 + BIT}, "return"),
     "gimbal lost": ({"gimbal_lost": True}, {"gimbal_lost": False}, "return"),
     "ground station lost": ({"ground_away_s": 60.0 + BIT}, {"ground_away_s": 60.0}, "hold"),
+    "operator: pause": ({"operator": "hold"}, {"operator": "fly"}, "hold"),
     "telemetry stale": ({"telemetry_age_s": 0.5 + BIT}, {"telemetry_age_s": 0.5}, "hold"),
     "estimate jumped": (
         {"jump_age_s": ESTIMATE_STEADY_S - BIT},
@@ -56,7 +59,17 @@ IN_FLIGHT: dict[str, tuple[dict[str, Any], dict[str, Any], Action]] = {
     ),
 }
 """What makes a row hold, what nearly does, and its order; the upper row is named when two order the same."""
-FOR_GOOD = {"telemetry lost", "battery critical", "geofence", "mission end", "battery low", "gimbal lost"}
+FOR_GOOD = {
+    "telemetry lost",
+    "operator: land",
+    "battery critical",
+    "geofence",
+    "mission end",
+    "operator: return",
+    "battery low",
+    "gimbal lost",
+}
+OPERATORS = {"operator: land", "operator: return", "operator: pause"}
 BLIND = {"telemetry stale", "estimate jumped"}
 BY_AUTHORITY: dict[Authority, tuple[str, Action]] = {
     "ready": ("not ours yet", "wait"),
@@ -185,6 +198,12 @@ def test_a_drone_on_the_ground_that_may_not_fly_stays_there(name: str, at_end: s
     assert (order.action, order.policy) == ("land", name)
 
 
+def test_a_paused_drone_on_the_ground_takes_off_when_it_may() -> None:
+    policies = Policies(MISSION)
+    assert policies.decide(bad("operator: pause", authority="ready")).action == "land"
+    assert policies.decide(Situation("ready")).action == "wait"
+
+
 @pytest.mark.parametrize("name", ["telemetry lost", "battery critical"])
 def test_a_drone_that_takes_off_comes_down_for_what_cannot_wait(name: str) -> None:
     order = Policies(MISSION).decide(bad(name, authority="starting"))
@@ -209,7 +228,8 @@ def test_a_hold_waits_for_as_long_as_the_vehicle_does_not_obey() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", sorted(set(IN_FLIGHT) - {"telemetry lost", "battery critical", "battery low", "mission end"})
+    "name",
+    sorted(set(IN_FLIGHT) - {"telemetry lost", "battery critical", "battery low", "mission end"} - OPERATORS),
 )
 @pytest.mark.parametrize("authority", ["ready", "starting"])
 def test_the_other_rows_wait_until_the_drone_is_ours(name: str, authority: Authority) -> None:

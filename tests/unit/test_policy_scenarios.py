@@ -14,6 +14,7 @@ SCENARIOS = Path("tests/scenario/test_px4_failures.py")
 BATTERIES = "test_batteries_a_gimbal_and_a_pilot"
 TELEMETRY = "test_telemetry_an_estimate_a_fence_and_a_refusal"
 PROCESSES = "test_an_agent_stopped_one_killed_and_the_ground_station_lost"
+OPERATOR = "test_an_operator_pauses_returns_and_lands_drones"
 CUT = "test_the_others_fly_on_and_land_when_a_link_is_cut_for_good"
 
 SHOWN_BY = {
@@ -29,6 +30,9 @@ SHOWN_BY = {
     "telemetry stale": TELEMETRY,
     "estimate jumped": TELEMETRY,
     "not ours yet": TELEMETRY,
+    "operator: land": OPERATOR,
+    "operator: return": OPERATOR,
+    "operator: pause": OPERATOR,
 }
 
 

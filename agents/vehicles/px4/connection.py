@@ -129,7 +129,10 @@ class Connection:
             if heard_s is not None and now_s() - heard_s >= ALONE_S:
                 return systems[self._system_id]
             if heard_s is None and now_s() > deadline_s:
-                raise VehicleError(f"{self._url}: no vehicle was heard for {timeout_s:g} s")
+                raise VehicleError(
+                    f"{self._url}: no vehicle was heard for {timeout_s:g} s;"
+                    " does it run and send there? docs/px4.md, or fly without one: --vehicles px4-endpoint"
+                )
             await asyncio.sleep(POLL_S)
 
     def _autopilots(self) -> dict[int, System]:

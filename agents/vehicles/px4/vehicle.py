@@ -180,6 +180,9 @@ class Px4Vehicle:
             self._put(prepared, frames.ned_vector(sent[:3]))
         return sent
 
+    def pass_tick(self, tick: int) -> None:
+        """Nothing: nobody waits for it."""
+
     def stop(self) -> None:
         """Nothing is sent while the vehicle is not ours."""
         with self._lock:
