@@ -316,9 +316,10 @@ class GroundStation:
         """The page that people open, made from what is in the folder, the whole recording too."""
         from ground_station.report import write_report  # plotting is not wanted in memory during the flight
 
-        self._board.activity = "writing the report"
         await asyncio.to_thread(self._recorder.close)
-        await self._feedback.on_worker(lambda: write_report(self._run.path))
+        if self._mission.recording.report:
+            self._board.activity = "writing the report"
+            await self._feedback.on_worker(lambda: write_report(self._run.path))
         self._board.activity = self._reason
 
 

@@ -24,9 +24,12 @@ class Console(Settings):
 
 
 class Recording(Settings):
-    """The run as one MCAP file, which Foxglove opens."""
+    """What a run leaves for people: one MCAP file, which Foxglove opens, and a report."""
 
     enabled: bool = True
+    report: bool = True
+    """Whether the report is written at the end; some ten seconds of processor time, and `covrecon report` makes it at
+    any later time."""
     mesh_period_s: Positive = 10.0
     """Mission time between two recorded meshes and pictures of phi."""
     queue: Annotated[int, Field(ge=16, le=1_000_000)] = 2000

@@ -34,7 +34,7 @@ _MODES: Final[dict[Mode, tuple[Severity, str]]] = {
 class FleetRow:
     drone: int
     mode: str
-    """As the state says; "waiting" before the first, "lost" when its process is gone."""
+    """As the state says; "waiting" before the first, "lost" when its process is gone, "ended" when it may be."""
     severity: Severity
     """Of the worst of ``reasons``."""
     reasons: tuple[str, ...]
@@ -52,21 +52,31 @@ class FleetRow:
 
 
 def fleet_row(
-    drone: int, state: DroneState | None, link_age_s: float | None, alive: bool, vehicles: Vehicles = DEFAULTS
+    drone: int,
+    state: DroneState | None,
+    link_age_s: float | None,
+    alive: bool,
+    vehicles: Vehicles = DEFAULTS,
+    *,
+    finished: bool = False,
 ) -> FleetRow:
     """``link_age_s``: since ``state`` came; ``alive``: whether its process has a liveliness token; ``vehicles``: the
-    mission's, for when a battery is low and telemetry is stale."""
+    mission's, for when a battery is low and telemetry is stale; ``finished``: whether the mission is over."""
     if state is None:
         waiting = "not heard yet" if alive else "its process is not there yet"
         return FleetRow(drone, "waiting", "notice", (waiting,), None, None, "", None, None, None, None)
-    found = [*_of_link(state, link_age_s, alive), *_of_state(state, vehicles)]
     control = state.control
-    if control is not None:
-        found += _of_control(control, vehicles)
+    # Simulated vehicles fall asleep where they are; real ones are brought down first.
+    ended = finished and not alive and vehicles.kind == "simulated"
+    if ended:
+        found: list[tuple[Severity, str]] = [("notice", "its process has ended with the mission")]
+    else:
+        found = [*_of_link(state, link_age_s, alive), *_of_state(state, vehicles)]
+        found += [] if control is None else _of_control(control, vehicles)
     found.sort(key=lambda worry: SEVERITIES.index(worry[0]), reverse=True)
     return FleetRow(
         drone=drone,
-        mode=state.mode if alive or state.mode == "landed" else "lost",
+        mode=state.mode if alive or state.mode == "landed" else "ended" if ended else "lost",
         severity=found[0][0] if found else "good",
         reasons=tuple(reason for _, reason in found),
         battery=state.battery,

@@ -30,7 +30,7 @@ class Drone:
 class Situation:
     def __init__(self, mission: Mission, now_s: Callable[[], float]) -> None:
         """``now_s``: monotonic seconds, to judge silence by."""
-        self._now_s = now_s
+        self._mission, self._now_s = mission, now_s
         self.drones = {drone.id: Drone() for drone in mission.drones}
         self.status: Status | None = None
         self.phase: MissionPhase | None = None
@@ -75,12 +75,15 @@ class Situation:
     def fleet(self, alive: Collection[str]) -> list[FleetRow]:
         """``alive``: roles with a liveliness token."""
         now_s = self._now_s()
+        finished = self.phase is not None and self.phase.phase == "finished"
         return [
             fleet_row(
                 number,
                 drone.state,
                 None if drone.state is None else now_s - drone.heard_s,
                 f"drone/{number}" in alive,
+                self._mission.vehicles,
+                finished=finished,
             )
             for number, drone in sorted(self.drones.items())
         ]

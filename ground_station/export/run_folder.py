@@ -13,20 +13,19 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from ground_station import results
 from ground_station.checkpoint import CHECKPOINT_FILE, MAGIC, PREVIOUS_FILE
 from ground_station.export.source import Flight, Importance, Progress, unwatched
+from ground_station.flown_mission import read_mission
 from ground_station.keyframe_log import KEYFRAMES_FILE
 from ground_station.mesh_files import read_ply
 from ground_station.reconstruction.reconstructor import Mesh
 from ground_station.record_file import Data, lay_out
 from ground_station.trajectories import UNREADABLE, read_trajectories
-from protocol.errors import CovreconError, MessageError, MissionError, StorageError
+from protocol.errors import CovreconError, MessageError, StorageError
 from protocol.field import VirtualField
 from protocol.messages import Keyframe
-from protocol.mission import Mission
 from protocol.wire import decode
 
 log = logging.getLogger(__name__)
@@ -39,7 +38,7 @@ class RunFolderSource:
         """Raises MissionError if it is no run's folder."""
         self.path = path
         self._progress = progress
-        self.mission = _mission(path / results.MISSION_FILE)
+        self.mission = read_mission(path)
 
     def keyframes(self) -> Iterator[Keyframe]:
         file = self.path / KEYFRAMES_FILE
@@ -105,15 +104,6 @@ class RunFolderSource:
             f"{self.path}: has neither {results.PHI_FILE}, which is written when a flight has ended, "
             "nor a checkpoint that is whole"
         )
-
-
-def _mission(file: Path) -> Mission:
-    try:
-        return Mission.model_validate_json(file.read_bytes())
-    except OSError as error:
-        raise MissionError([f"{file}: {error.strerror}; is this the folder of a run?"]) from error
-    except ValidationError as error:
-        raise MissionError([f"{file}: {fault['loc']}: {fault['msg']}" for fault in error.errors()]) from error
 
 
 @contextmanager

@@ -28,11 +28,13 @@ COVERING = ("flying", "braking", "joining")
 ROUTINE = ("", "starting", "flying", "braking")
 """Modes that are no news; braking is told with its reason."""
 SEVERITY_OF_MODE: dict[str, Severity] = {"yielded": "error", "landed": "note"}
-BARRIERS = (
-    ("separation", "m²", "separation_margin_m2"),
-    ("flight region", "m", "region_margin_m"),
-    ("camera pitch", "rad²", "pitch_margin_rad2"),
+BARRIERS: tuple[tuple[str, str, str, Severity], ...] = (
+    ("inside the separation as lag and late commands widen it", "m²", "separation_margin_m2", "warning"),
+    ("barrier of the flight region broken", "m", "region_margin_m", "error"),
+    ("barrier of the camera pitch broken", "rad²", "pitch_margin_rad2", "error"),
 )
+"""What it means that one is below zero. The separation's is wider than the distance that must be kept, by what a
+vehicle may fly on until a command works."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,11 +57,11 @@ def faults(run: Run) -> list[Fault]:
             found.append(Fault(time_s, time_s, event.source, event.text, event.level))
     if run.flight is not None and len(run.flight.time_s):
         for index, drone in enumerate(run.flight.drones.tolist()):
-            found += _of_drone(run.flight, index, f"drone/{drone}")
+            found += _of_drone(run.flight, index, f"drone/{drone}", run.mission.flight.separation_m)
     return sorted(found, key=lambda fault: (fault.start_s, fault.source, fault.text))
 
 
-def _of_drone(flight: Flight, index: int, source: str) -> Iterator[Fault]:
+def _of_drone(flight: Flight, index: int, source: str, separation_m: float) -> Iterator[Fault]:
     time_s, mode, fallback = flight.time_s, flight.mode[:, index], flight.fallback[:, index]
 
     for spell in spells(time_s, fallback != "", BRIDGED_S):
@@ -82,11 +84,18 @@ def _of_drone(flight: Flight, index: int, source: str) -> Iterator[Fault]:
         if spell.end_s - spell.start_s >= SILENT_S:
             yield _fault(spell, source, "not heard", "error")
 
-    for name, unit, column in BARRIERS:
+    for meaning, unit, column, severity in BARRIERS:
         margin = getattr(flight, column)[:, index]
         for spell in spells(time_s, margin < BROKEN, BRIDGED_S):
             worst = np.nanmin(margin[spell.first : spell.behind])
-            yield _fault(spell, source, f"barrier of the {name} broken, {worst:.3g} {unit} at worst", "error")
+            yield _fault(spell, source, f"{meaning}, {worst:.3g} {unit} at worst", severity)
+
+    others = np.delete(flight.poses[:, :, :3], index, axis=1)
+    distances = np.linalg.norm(others - flight.poses[:, index, None, :3], axis=2)
+    nearest = np.fmin.reduce(distances, axis=1, initial=np.inf)
+    for spell in spells(time_s, nearest < separation_m, BRIDGED_S):
+        closest = np.nanmin(nearest[spell.first : spell.behind])
+        yield _fault(spell, source, f"{closest:.3f} m from another drone, less than {separation_m:g} m", "error")
 
 
 def _fault(spell: Spell, source: str, text: str, severity: Severity) -> Fault:

@@ -9,36 +9,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from ground_station import results
+from ground_station.flown_mission import read_mission
 from ground_station.mesh_files import read_ply
 from ground_station.report.history import history_of
 from ground_station.report.run_data import Curves, Flight, Mesh, Run, flight_of
 from ground_station.trajectories import read_trajectories
-from protocol.errors import CovreconError, MissionError
-from protocol.mission import Mission
+from protocol.errors import CovreconError
 
 
 def load_run(folder: Path) -> Run:
     """Raises MissionError without a readable mission, CovreconError naming any other file that cannot be read."""
     return Run(
-        mission=_mission(folder / results.MISSION_FILE),
+        mission=read_mission(folder),
         curves=_curves(folder / results.METRICS_FILE),
         flight=_flight(folder / results.TRAJECTORIES_FILE),
         mesh=_mesh(folder / results.MESH_PLY_FILE),
         summary=_summary(folder / results.SUMMARY_FILE),
         history=history_of(folder),
     )
-
-
-def _mission(path: Path) -> Mission:
-    try:
-        return Mission.model_validate_json(path.read_bytes())
-    except OSError as error:
-        raise MissionError([f"{path}: {error.strerror}; is this the folder of a run?"]) from error
-    except ValidationError as error:
-        raise MissionError([f"{path}: {fault['loc']}: {fault['msg']}" for fault in error.errors()]) from error
 
 
 def _curves(path: Path) -> Curves:

@@ -61,6 +61,8 @@ height_px = 90
 [reconstruction]
 sweep_width_px = 80
 depth_planes = 32
+[recording]
+report = false
 [simulation]
 scene = "{scene}"
 start_patience_s = {patience}

@@ -61,6 +61,8 @@ height_px = 45
 [reconstruction]
 sweep_width_px = 40
 depth_planes = 16
+[recording]
+report = false
 [simulation]
 scene = "{scene}"
 [replication]

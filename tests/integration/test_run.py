@@ -42,6 +42,8 @@ height_px = 90
 [reconstruction]
 sweep_width_px = 80
 depth_planes = 32
+[recording]
+report = {report}
 [simulation]
 scene = "{scene}"
 [[drones]]
@@ -60,9 +62,9 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def mission(tmp_path: Path, scene: Path) -> Write:
-    def write(duration: float = 10.0, extra: str = "") -> Path:
+    def write(duration: float = 10.0, extra: str = "", *, report: bool = False) -> Path:
         path = tmp_path / "small.toml"
-        path.write_text(MISSION.format(duration=duration, scene=scene) + extra)
+        path.write_text(MISSION.format(duration=duration, scene=scene, report=str(report).lower()) + extra)
         return path
 
     return write
@@ -107,7 +109,7 @@ def finish(run: subprocess.Popen[str]) -> tuple[int, str]:
 def test_a_mission_maps_its_scene_and_a_second_one_is_equal_to_the_last_bit(
     tmp_path: Path, mission: Write, fly: Fly
 ) -> None:
-    path = mission(duration=14.0)
+    path = mission(duration=14.0, report=True)
     outcomes = []
     for out in ("first", "second"):
         code, output = finish(fly(path, "--speed", "max", out=out))

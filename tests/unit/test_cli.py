@@ -1,15 +1,21 @@
 from __future__ import annotations
 
+import io
 import resource
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from cyclopts import App
+from rich.console import Console
 
+from deploy.cli import app
 from protocol.guard import ROOT
 from protocol.mission_file import load_mission, mission_to_json
 
+PROCESSES = {"agent", "console", "ground", "px4-endpoint", "router", "sim"}
 HELP_CPU_S = 1.0
 """Bound of processor time for --help: three times what it takes, so that only a heavy import breaks it."""
 
@@ -126,3 +132,22 @@ def test_a_foreign_package_is_refused_before_anything_runs(tmp_path: Path) -> No
 
     assert result.returncode == 1
     assert result.stderr.startswith(f"package 'agents' would come from {tmp_path}/agents, not from ")
+
+
+def test_every_command_has_an_example_in_its_help() -> None:
+    def lacking(commands: App, path: tuple[str, ...]) -> Iterator[str]:
+        for name in commands:
+            words = (*path, name)
+            if name.startswith("-") or name in PROCESSES:  # a process has its own help
+                continue
+            command = commands[name]
+            if any(not below.startswith("-") for below in command):
+                yield from lacking(command, words)
+                continue
+            text = io.StringIO()
+            command.help_print(console=Console(file=text, width=200))
+            usage, _, rest = text.getvalue().partition("\n")
+            if f"covrecon {' '.join(words)}" not in rest:
+                yield f"{' '.join(words)}: {usage}"
+
+    assert list(lacking(app, ())) == []

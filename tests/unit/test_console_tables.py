@@ -142,6 +142,14 @@ def test_a_drone_that_has_landed_may_leave() -> None:
     assert fleet_row(2, state("flying"), 60.0, alive=False).mode == "lost"
 
 
+def test_a_simulated_drone_that_ends_with_its_mission_is_not_lost_but_a_real_one_in_the_air_is() -> None:
+    ended = fleet_row(2, state("returning"), 60.0, alive=False, finished=True)
+    real = fleet_row(2, state("returning"), 60.0, False, Vehicles(kind="px4"), finished=True)
+
+    assert (ended.mode, ended.severity) == ("ended", "notice")
+    assert (real.mode, real.severity) == ("lost", "bad")
+
+
 def test_a_lone_drone_has_no_separation_and_one_without_a_decision_no_figures() -> None:
     assert fleet_row(2, state(separation_margin_m2=1e9), 0.0, alive=True).separation_margin_m2 is None
     undecided = fleet_row(2, state().model_copy(update={"control": None}), 0.0, alive=True)

@@ -22,13 +22,13 @@ MISSION = Mission(name="m", drones=(Drone(id=1, start=(0, 0, 2, 0, 1.3)), Drone(
 CALM = told()
 
 
-def run(ticks: Sequence[Mapping[int, DroneState | None]], events: Sequence[Event] = ()) -> Run:
+def run(ticks: Sequence[Mapping[int, DroneState | None]], events: Sequence[Event] = (), apart_m: float = 2.0) -> Run:
     """Each tick's states by drone; one that is left out told nothing new and flies, None is not heard at all."""
     trajectories = Trajectories([1, 2])
     for tick, states in enumerate(ticks):
         heard = {drone: states.get(drone, CALM) for drone in (1, 2)}
         known = {drone: state for drone, state in heard.items() if state is not None}
-        trajectories.add(tick, tick / 20, dict.fromkeys(known, (0.0, 0.0, 2.0, 0.0, 1.3)), known)
+        trajectories.add(tick, tick / 20, {drone: (drone * apart_m, 0.0, 2.0, 0.0, 1.3) for drone in known}, known)
     return Run(MISSION, {}, flight_of(trajectories.arrays()), None, None, History(events=events))
 
 
@@ -72,7 +72,20 @@ def test_a_broken_barrier_is_told_with_its_worst_and_rounding_is_not() -> None:
     rounding = told(margins=(-1e-9, 1.0, 0.1))
     ticks = [{1: rounding}] * 3 + [{1: told(margins=(-0.02, 1.0, 0.1))}, {1: told(margins=(-0.05, 1.0, 0.1))}, {}]
     assert faults(run(ticks)) == [
-        Fault(0.15, 0.25, "drone/1", "barrier of the separation broken, -0.05 m² at worst", "error")
+        Fault(
+            0.15,
+            0.25,
+            "drone/1",
+            "inside the separation as lag and late commands widen it, -0.05 m² at worst",
+            "warning",
+        )
+    ]
+
+
+def test_drones_that_come_too_near_are_an_error() -> None:
+    assert [(fault.source, fault.text, fault.severity) for fault in faults(run([{}, {}], apart_m=0.75))] == [
+        ("drone/1", "0.750 m from another drone, less than 1 m", "error"),
+        ("drone/2", "0.750 m from another drone, less than 1 m", "error"),
     ]
 
 
