@@ -15,9 +15,12 @@ settings.load_profile("covrecon")
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist looks for the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests that start processes run one after another, on one worker: they would starve each other of cores."""
+    """Tests that fly missions of processes run one after another, on one worker: they would starve each other of cores.
+    So do those that start a process or two, which may run beside a flight."""
     for item in items:
-        if item.path.relative_to(TESTS).parts[0] in ("integration", "benchmarks") or "processes" in item.keywords:
+        if "light" in item.keywords:
+            item.add_marker(pytest.mark.xdist_group("light"))
+        elif item.path.relative_to(TESTS).parts[0] in ("integration", "benchmarks") or "processes" in item.keywords:
             item.add_marker(pytest.mark.xdist_group("processes"))
 
 

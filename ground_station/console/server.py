@@ -15,6 +15,7 @@ from pathlib import Path
 import viser
 
 from ground_station.console.guard import TOKEN_BYTES, Guard, guarded, is_loopback, listen
+from ground_station.durable import draft_of
 from protocol.operation_settings import Console
 
 log = logging.getLogger(__name__)
@@ -62,7 +63,9 @@ def _in_url(host: str) -> str:
 
 
 def _write_private(path: Path, text: str) -> None:
-    """For nobody else's eyes, at no moment."""
-    path.unlink(missing_ok=True)
-    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+    """For nobody else's eyes, at no moment, and whole as soon as it is there."""
+    draft = draft_of(path)
+    draft.unlink(missing_ok=True)
+    with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
         file.write(text + "\n")
+    draft.replace(path)

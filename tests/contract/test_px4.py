@@ -22,7 +22,7 @@ from protocol.vehicle_settings import Vehicles
 from sim_bridge.px4_endpoint.endpoint import Endpoint
 from sim_bridge.px4_endpoint.frames import unproject
 
-pytestmark = [pytest.mark.processes, pytest.mark.xdist_group("processes"), pytest.mark.timeout(60)]
+pytestmark = [pytest.mark.light, pytest.mark.timeout(60)]
 
 URLS = [url for url in os.environ.get("COVRECON_PX4_URLS", "").split(",") if url]
 OTHERS = [pytest.param(url, id=url) for url in URLS] or [

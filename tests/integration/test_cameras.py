@@ -25,7 +25,7 @@ from protocol.errors import VehicleError
 from protocol.messages import Keyframe
 from protocol.mission import Camera, Drone, Mission
 
-pytestmark = pytest.mark.processes
+pytestmark = pytest.mark.light
 
 PATIENCE_S = 20.0
 SIZE = (512, 288)

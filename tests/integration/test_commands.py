@@ -21,6 +21,8 @@ from protocol.messages import CommandReply
 from protocol.mission import Mission
 from protocol.verbs import Verb
 
+pytestmark = pytest.mark.light
+
 DRONES = (1, 3)
 PATIENCE_S = 10.0
 

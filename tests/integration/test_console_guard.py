@@ -22,6 +22,8 @@ from ground_station.console.server import ADDRESS_FILE, serving
 from protocol.errors import BusError, ProcessError
 from protocol.operation_settings import Console
 
+pytestmark = pytest.mark.light
+
 PATIENCE_S = 10.0
 SUBPROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
 

@@ -26,7 +26,7 @@ from protocol.vehicle_settings import Autopilot, Parameter, Vehicles
 from sim_bridge.px4_endpoint.endpoint import Endpoint
 from sim_bridge.px4_endpoint.vehicle import Vehicle
 
-pytestmark = pytest.mark.processes
+pytestmark = pytest.mark.light
 
 DRONE = 3
 START = (1.0, 2.0, 1.0, 2.5, 1.3)

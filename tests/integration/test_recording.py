@@ -25,6 +25,8 @@ from ground_station.recording.recorder import Recorder
 from ground_station.recording.repair import repair
 from protocol.errors import RecordingError
 
+pytestmark = pytest.mark.light
+
 LOST_S = 5.0
 """Of mission time, in real time, that a killed ground station may lose."""
 

@@ -21,7 +21,7 @@ from faults.px4_flight import PATIENCE_S, px4_mission
 from protocol.geometry import Floats
 from sim_bridge.px4_endpoint.endpoint import Endpoint
 
-pytestmark = pytest.mark.processes
+pytestmark = pytest.mark.light
 
 DRONE = 1
 WISH = np.array([0.4, 0.0, 0.0, 0.0, 0.0])

@@ -14,7 +14,7 @@ from deploy.completion_command import Shell, completion_of
 
 BASH = shutil.which("bash") or ""
 pytestmark = [
-    pytest.mark.processes,
+    pytest.mark.light,
     pytest.mark.skipif(not BASH, reason="there is no bash to complete in"),
 ]
 

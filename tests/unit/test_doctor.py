@@ -151,7 +151,7 @@ def test_an_installed_copy_asks_its_own_metadata(tmp_path: Path) -> None:
     assert known["opencv-python-headless"] == "camera"
 
 
-@pytest.mark.processes
+@pytest.mark.light
 def test_libraries_are_loaded_where_they_can_do_no_harm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     modules = {
         "talks": "print('covrecon is a word')",
@@ -412,7 +412,7 @@ def test_a_failure_is_the_exit_code_and_machines_get_json(
     ]
 
 
-@pytest.mark.processes
+@pytest.mark.light
 def test_this_computer_is_examined_from_end_to_end(tmp_path: Path) -> None:
     mission = MISSION.model_copy(update={"console": Console(port=0)})
     found = list(examination.examine(mission, tmp_path))

@@ -152,7 +152,7 @@ def test_an_unknown_format_is_refused_with_those_there_are() -> None:
         configure("agents", environment={"COVRECON_LOG": "xml"})
 
 
-@pytest.mark.processes
+@pytest.mark.light
 def test_every_line_of_a_process_that_crashes_is_a_record() -> None:
     program = """
 import threading
