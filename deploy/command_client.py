@@ -13,12 +13,10 @@ from protocol import topics
 from protocol.bus import Bus, connect
 from protocol.errors import BusError, CommandError, NoReply
 from protocol.messages import CommandReply
-from protocol.verbs import Verb
+from protocol.verbs import ASK_AGAIN_S, ASK_TIMEOUT_S, Verb, command_parameters
 
 CONNECT_S = 5.0
 """How long the router may take to answer."""
-ASK_AGAIN_S = 0.3
-ASK_TIMEOUT_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +58,7 @@ async def command(
 
 
 async def _insist(bus: Bus, verb: Verb, drones: Sequence[int], say: Callable[[str], None], patience_s: float) -> None:
-    question = f"id={secrets.token_hex(8)};verb={verb};drones={'+'.join(map(str, drones))}"
+    question = command_parameters(secrets.token_hex(8), verb, drones)
     clock = asyncio.get_running_loop().time
     deadline = clock() + patience_s
     newest: CommandReply | None = None

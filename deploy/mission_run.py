@@ -18,11 +18,12 @@ from ground_station.rehearsal import rehearse
 from protocol.errors import ProcessError
 from protocol.importance import compile_kernels
 from protocol.mission import Mission
+from protocol.operation_settings import CONSOLE_FILE
 
 Speed = Literal["max", "1"]
 
-CONSOLE_FILE, CONSOLE_POLL_S = "console.json", 0.3
-"""Where the console leaves its address, and how often it is looked for, wall time."""
+CONSOLE_POLL_S = 0.3
+"""How often the console's address is looked for, wall time."""
 LANDING_S = 180.0
 """What drones in the air get to come home and down once the ground station is done."""
 

@@ -13,6 +13,10 @@ FirstPort = Annotated[int, Field(ge=0, le=65535 - 256)]
 """Of as many as a mission may have processes."""
 
 
+CONSOLE_FILE = "console.json"
+"""In the run's folder, while the console serves: its address with the token, for its owner's eyes alone."""
+
+
 class Console(Settings):
     """The page in the browser (`covrecon run --console`)."""
 

@@ -19,12 +19,10 @@ from protocol import topics
 from protocol.bus import Bus
 from protocol.errors import BusError
 from protocol.messages import CommandReply
-from protocol.verbs import Verb
+from protocol.verbs import ASK_AGAIN_S, ASK_TIMEOUT_S, Verb, command_parameters
 
 log = logging.getLogger(__name__)
 
-ASK_AGAIN_S = 0.3
-ASK_TIMEOUT_S = 1.0
 UNANSWERED_S = 5.0
 """For so long a command that nobody answers is repeated; a ground station that is started again takes longer."""
 KEPT = 5
@@ -97,7 +95,7 @@ class CommandSender:
                 await task
 
     async def _insist(self, command: Sent) -> None:
-        question = f"id={command.id};verb={command.verb};drones={'+'.join(map(str, command.drones))}"
+        question = command_parameters(command.id, command.verb, command.drones)
         clock = asyncio.get_running_loop().time
         deadline = clock() + UNANSWERED_S
         while not command.is_over:

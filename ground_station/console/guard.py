@@ -123,7 +123,7 @@ def guarded(guard: Guard, listening: socket.socket) -> Iterator[None]:
     def guarded_serve(
         handler: Callable[..., Any],
         host: str,  # noqa: ARG001  # viser's, and that it would try the next port when one is taken
-        port_wished: int,  # noqa: ARG001
+        port_wished: int,  # noqa: ARG001  # likewise
         *,
         process_request: Callable[[ServerConnection, Request], Response | None],
         **options: Any,

@@ -16,11 +16,9 @@ import viser
 
 from ground_station.console.guard import TOKEN_BYTES, Guard, guarded, is_loopback, listen
 from ground_station.durable import draft_of
-from protocol.operation_settings import Console
+from protocol.operation_settings import CONSOLE_FILE, Console
 
 log = logging.getLogger(__name__)
-
-ADDRESS_FILE = "console.json"
 
 
 class Server(viser.ViserServer):
@@ -45,7 +43,7 @@ def serving(settings: Console, title: str, run: Path) -> Iterator[Server]:
         port = listening.getsockname()[1]
         with contextlib.redirect_stdout(io.StringIO()), guarded(Guard(settings.host, token), listening):
             server = Server(settings.host, port, label=title, verbose=False)  # prints an address without the token
-        address = run / ADDRESS_FILE
+        address = run / CONSOLE_FILE
         with contextlib.redirect_stdout(sys.stderr):  # viser says when it stops, and when a page is not of its version
             try:
                 url = f"http://{_in_url(settings.host)}:{port}/?token={token}"

@@ -18,9 +18,9 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from ground_station.console.guard import Guard, guarded, listen
-from ground_station.console.server import ADDRESS_FILE, serving
+from ground_station.console.server import serving
 from protocol.errors import BusError, ProcessError
-from protocol.operation_settings import Console
+from protocol.operation_settings import CONSOLE_FILE, Console
 
 pytestmark = pytest.mark.light
 
@@ -64,7 +64,7 @@ class Open:
 def console(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Open]:
     folder = tmp_path_factory.mktemp("run")
     with serving(Console(port=0), "a mission", folder):
-        url = urlsplit(json.loads((folder / ADDRESS_FILE).read_text())["url"])
+        url = urlsplit(json.loads((folder / CONSOLE_FILE).read_text())["url"])
         assert url.port is not None
         token = url.query.removeprefix("token=")
         yield Open(url.port, token, f"covrecon_console_{url.port}={token}")
@@ -128,7 +128,7 @@ def test_whoever_comes_through_a_tunnel_from_another_port_is_let_in(console: Ope
 
 
 def test_the_address_is_kept_where_only_its_owner_can_read_it_and_only_while_it_is_good(tmp_path: Path) -> None:
-    address = tmp_path / ADDRESS_FILE
+    address = tmp_path / CONSOLE_FILE
     address.write_text("of an earlier console")
     address.chmod(0o644)
 

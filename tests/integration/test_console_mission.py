@@ -12,13 +12,12 @@ from pathlib import Path
 import pytest
 from playwright.async_api import Page, async_playwright, expect
 
+from faults.browser import BROWSER, OPTIONS, needs_browser
 from faults.processes import processes_of, small_mission
 from protocol.mission_file import mission_to_json
 from protocol.operation_settings import Console
 
 COVRECON = Path(sys.executable).with_name("covrecon")
-CHROMIUM = Path("/usr/bin/chromium")
-CHROMIUM_OPTIONS = ["--no-sandbox", "--enable-unsafe-swiftshader"]
 PATIENCE_S = 90.0
 """For processes to start on a busy machine; what is pressed works within a second."""
 POLL_S = 0.1
@@ -26,7 +25,7 @@ POLL_S = 0.1
 pytestmark = [
     pytest.mark.processes,
     pytest.mark.timeout(300),
-    pytest.mark.skipif(not CHROMIUM.exists(), reason=f"no browser at {CHROMIUM}"),
+    needs_browser,
 ]
 
 
@@ -59,7 +58,7 @@ async def page(run: asyncio.subprocess.Process, tmp_path: Path) -> AsyncIterator
     address = tmp_path / "runs" / "latest" / "console.json"
     await until(lambda: address.exists() or run.returncode is not None, "no console")
     async with async_playwright() as playwright:
-        browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=CHROMIUM_OPTIONS)
+        browser = await playwright.chromium.launch(executable_path=BROWSER, args=OPTIONS)
         page = await browser.new_page(viewport={"width": 900, "height": 1000})
         page.set_default_timeout(PATIENCE_S * 1000)
         expect.set_options(timeout=PATIENCE_S * 1000)

@@ -19,15 +19,13 @@ from playwright.async_api import ConsoleMessage, Locator, Page, Request, Viewpor
 
 from deploy.local import environment
 from deploy.run_folder import socket_endpoint
+from faults.browser import BROWSER, OPTIONS, needs_browser
 from faults.processes import small_mission
 from faults.scripted_ground import ScriptedGround
-from ground_station.console.server import ADDRESS_FILE
 from protocol.bus import connect
 from protocol.mission_file import mission_to_json
-from protocol.operation_settings import Console
+from protocol.operation_settings import CONSOLE_FILE, Console
 
-CHROMIUM = Path("/usr/bin/chromium")
-CHROMIUM_OPTIONS = ["--no-sandbox", "--enable-unsafe-swiftshader"]
 PATIENCE_S = 40.0
 SMALL, LARGE = ViewportSize(width=900, height=1000), ViewportSize(width=1400, height=900)
 """With the small one little is left for the scene, which takes seconds a frame to draw without a graphics card."""
@@ -39,7 +37,7 @@ DRONES = (1, 3)
 pytestmark = [
     pytest.mark.processes,
     pytest.mark.asyncio(loop_scope="module"),
-    pytest.mark.skipif(not CHROMIUM.exists(), reason=f"no browser at {CHROMIUM}"),
+    needs_browser,
 ]
 
 
@@ -93,10 +91,10 @@ async def opened(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Open
             )
         stack.push_async_callback(console.wait)
         stack.callback(console.send_signal, signal.SIGTERM)
-        await until((run / ADDRESS_FILE).exists)
-        url = json.loads((run / ADDRESS_FILE).read_text())["url"]
+        await until((run / CONSOLE_FILE).exists)
+        url = json.loads((run / CONSOLE_FILE).read_text())["url"]
         playwright = await stack.enter_async_context(async_playwright())
-        browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=CHROMIUM_OPTIONS)
+        browser = await playwright.chromium.launch(executable_path=BROWSER, args=OPTIONS)
         stack.push_async_callback(browser.close)
         page = await browser.new_page(viewport=SMALL)
         page.set_default_timeout(PATIENCE_S * 1000)

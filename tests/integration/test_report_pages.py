@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from faults.browser import BROWSER, OPTIONS, needs_browser
 from faults.told import told
 from ground_station.report import write_report
 from ground_station.results import Metrics, RunFolder
@@ -20,11 +21,10 @@ from protocol.field import VirtualField
 from protocol.mission import Drone, Mission
 
 playwright = pytest.importorskip("playwright.sync_api", reason="the browser tests need playwright")
-CHROMIUM = Path("/usr/bin/chromium")
 
 pytestmark = [
     pytest.mark.processes,
-    pytest.mark.skipif(not CHROMIUM.exists(), reason=f"the browser tests need {CHROMIUM}"),
+    needs_browser,
 ]
 
 MISSION = Mission.model_validate(
@@ -64,9 +64,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     with playwright.sync_playwright() as running:
-        chromium = running.chromium.launch(
-            executable_path=CHROMIUM, args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-        )
+        chromium = running.chromium.launch(executable_path=BROWSER, args=[*OPTIONS, "--use-angle=swiftshader"])
         yield chromium
         chromium.close()
 
