@@ -7,6 +7,7 @@
     |   `-- VersionError    ... because they speak another major version
     |-- BusError            the transport could not be opened, or is closed
     |   `-- NoReply         a query that nobody answered in time
+    |-- CredentialsError    a certificate or key that is missing, unsafe, foreign, expired or revoked
     |-- JournalError        a journal that cannot be written or read back
     |   `-- JournalDamaged  ... because what it holds is not what was written
     |-- StorageError        another file of the run that the disk refuses
@@ -56,6 +57,10 @@ class BusError(CovreconError):
 
 class NoReply(BusError):
     pass
+
+
+class CredentialsError(CovreconError):
+    """A certificate or key that is missing, unsafe, foreign, expired or revoked."""
 
 
 class JournalError(CovreconError):

@@ -17,6 +17,7 @@ from protocol.geometry import Intrinsics
 from protocol.operation_settings import Console, Metrics, Recording
 from protocol.separation import widened_separation
 from protocol.settings import Angle, Metres, NonNegative, Positive, Settings, Vector
+from protocol.transport_settings import Transport
 from protocol.vehicle_settings import Autopilot, Vehicles
 
 
@@ -223,13 +224,6 @@ class Simulation(Settings):
     """Standard deviation of the camera's noise, in grey levels of 255."""
     start_patience_s: Positive = 120.0
     """How long the first tick waits for all drones; one that comes later joins in flight."""
-
-
-class Transport(Settings):
-    """How the processes reach each other."""
-
-    endpoint: str = ""
-    """zenoh endpoint of the router; empty: a unix socket in a private folder."""
 
 
 class Replication(Settings):

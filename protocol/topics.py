@@ -1,6 +1,6 @@
-"""The one table of topics: who writes what, how urgent it is, and what may be lost.
+"""The one table of topics: who writes what and who reads it, how urgent it is, and what may be lost.
 
-Subscriptions, queues, freshness checks and later the recorder and the access rules are made from it.
+Subscriptions, queues, freshness checks, the recorder and the access rules (`protocol.access`) are made from it.
 All keys live under the namespace ``covrecon/<mission name>``.
 """
 
@@ -10,10 +10,11 @@ from dataclasses import dataclass
 from typing import Generic, Literal, TypeVar
 
 from protocol import messages
-from protocol.wire import Message
+from protocol.wire import MAX_MESSAGE_BYTES, Message
 
 M = TypeVar("M", bound=Message)
-Writer = Literal["agent", "ground", "sim"]
+Party = Literal["agent", "ground", "sim", "operator"]
+"""Kinds of process. sim: the internal simulator or the observer; operator: console, command line, live table."""
 Priority = Literal["REAL_TIME", "INTERACTIVE_HIGH", "INTERACTIVE_LOW", "DATA_HIGH", "DATA", "DATA_LOW", "BACKGROUND"]
 
 
@@ -22,14 +23,18 @@ class Topic(Generic[M]):
     key: str
     """Key expression; ``{drone}`` stands for a drone's id."""
     message: type[M]
-    writers: tuple[Writer, ...]
-    """Kinds of process that publish it."""
+    writers: tuple[Party, ...]
+    """Who publishes it, or answers to it."""
+    readers: tuple[Party, ...]
+    """Who subscribes to it, or asks."""
     priority: Priority
     queue: int
     """Messages kept for a slow reader; then the oldest is dropped and counted."""
     max_age_s: float
     """An older value must not be acted on; infinity where age does not matter."""
     recorded: bool
+    max_bytes: int
+    """A longer message is refused where it arrives: several times what a mission at its limits needs."""
     express: bool = False
     """Sent at once instead of being batched."""
     queryable: bool = False
@@ -41,24 +46,42 @@ class Topic(Generic[M]):
 
 _NO_AGE = float("inf")
 
-STATE = Topic("drone/{drone}/state", messages.DroneState, ("agent",), "INTERACTIVE_HIGH", 256, 0.4, True)
-KEYFRAME = Topic("drone/{drone}/keyframe", messages.Keyframe, ("agent", "sim"), "DATA_LOW", 256, _NO_AGE, True)
-SETPOINT = Topic("drone/{drone}/setpoint", messages.Setpoint, ("agent",), "REAL_TIME", 256, 0.5, True, express=True)
-TICK = Topic("clock/tick", messages.Tick, ("sim",), "REAL_TIME", 256, 0.5, True, express=True)
-JUMP = Topic("phi/jump", messages.Jump, ("ground",), "DATA_HIGH", 256, _NO_AGE, True)
-HEAD = Topic("phi/head", messages.JumpHead, ("ground",), "INTERACTIVE_LOW", 256, 2.0, True, express=True)
-JOURNAL = Topic("phi/journal", messages.JournalPage, ("ground",), "BACKGROUND", 16, _NO_AGE, False, queryable=True)
-DIGEST = Topic("phi/digest", messages.PhiDigest, ("ground",), "INTERACTIVE_LOW", 16, _NO_AGE, True)
-BLOCKS = Topic("phi/blocks", messages.PhiPage, ("ground",), "BACKGROUND", 16, _NO_AGE, False, queryable=True)
-DRONE_BLOCKS = Topic(
-    "drone/{drone}/phi", messages.PhiPage, ("agent",), "BACKGROUND", 16, _NO_AGE, False, queryable=True
-)
-PHASE = Topic("command/all", messages.MissionPhase, ("ground",), "REAL_TIME", 16, 2.0, True, express=True)
-COMMAND = Topic("command/request", messages.CommandReply, ("ground",), "REAL_TIME", 16, _NO_AGE, False, queryable=True)
-EVENT = Topic("drone/{drone}/event", messages.Event, ("agent",), "DATA_HIGH", 256, _NO_AGE, True)
-GROUND_EVENT = Topic("ground/event", messages.Event, ("ground",), "DATA_HIGH", 256, _NO_AGE, True)
-MAP = Topic("map/blocks", messages.MeshPage, ("ground",), "BACKGROUND", 4, _NO_AGE, False, queryable=True)
-STATUS = Topic("status", messages.Status, ("ground",), "INTERACTIVE_LOW", 4, 5.0, True)
+_KIB, _MIB = 2**10, 2**20
+
+# fmt: off
+STATE = Topic("drone/{drone}/state", messages.DroneState, ("agent",), ("agent", "ground", "sim", "operator"),
+              "INTERACTIVE_HIGH", 256, 0.4, True, 16 * _KIB)
+KEYFRAME = Topic("drone/{drone}/keyframe", messages.Keyframe, ("agent", "sim"), ("ground", "operator"),
+                 "DATA_LOW", 256, _NO_AGE, True, 8 * _MIB)
+SETPOINT = Topic("drone/{drone}/setpoint", messages.Setpoint, ("agent",), ("sim",),
+                 "REAL_TIME", 256, 0.5, True, 1 * _KIB, express=True)
+TICK = Topic("clock/tick", messages.Tick, ("sim",), ("agent", "ground", "operator"),
+             "REAL_TIME", 256, 0.5, True, 256 * _KIB, express=True)
+JUMP = Topic("phi/jump", messages.Jump, ("ground",), ("agent", "operator"),
+             "DATA_HIGH", 256, _NO_AGE, True, 8 * _MIB)
+HEAD = Topic("phi/head", messages.JumpHead, ("ground",), ("agent", "sim", "operator"),
+             "INTERACTIVE_LOW", 256, 2.0, True, 1 * _KIB, express=True)
+JOURNAL = Topic("phi/journal", messages.JournalPage, ("ground",), ("agent", "operator"),
+                "BACKGROUND", 16, _NO_AGE, False, MAX_MESSAGE_BYTES, queryable=True)
+DIGEST = Topic("phi/digest", messages.PhiDigest, ("ground",), ("agent", "operator"),
+               "INTERACTIVE_LOW", 16, _NO_AGE, True, 8 * _MIB)
+BLOCKS = Topic("phi/blocks", messages.PhiPage, ("ground",), ("agent", "operator"),
+               "BACKGROUND", 16, _NO_AGE, False, MAX_MESSAGE_BYTES, queryable=True)
+DRONE_BLOCKS = Topic("drone/{drone}/phi", messages.PhiPage, ("agent",), ("agent", "ground", "operator"),
+                     "BACKGROUND", 16, _NO_AGE, False, MAX_MESSAGE_BYTES, queryable=True)
+PHASE = Topic("command/all", messages.MissionPhase, ("ground",), ("agent", "sim", "operator"),
+              "REAL_TIME", 16, 2.0, True, 256 * _KIB, express=True)
+COMMAND = Topic("command/request", messages.CommandReply, ("ground",), ("operator",),
+                "REAL_TIME", 16, _NO_AGE, False, 16 * _KIB, queryable=True)
+EVENT = Topic("drone/{drone}/event", messages.Event, ("agent",), ("ground", "operator"),
+              "DATA_HIGH", 256, _NO_AGE, True, 16 * _KIB)
+GROUND_EVENT = Topic("ground/event", messages.Event, ("ground",), ("operator",),
+                     "DATA_HIGH", 256, _NO_AGE, True, 16 * _KIB)
+MAP = Topic("map/blocks", messages.MeshPage, ("ground",), ("operator",),
+            "BACKGROUND", 4, _NO_AGE, False, MAX_MESSAGE_BYTES, queryable=True)
+STATUS = Topic("status", messages.Status, ("ground",), ("operator",),
+               "INTERACTIVE_LOW", 4, 5.0, True, 256 * _KIB)
+# fmt: on
 
 TOPICS: tuple[Topic[Message], ...] = (  # type: ignore[assignment]  # read-only use of an invariant generic
     STATE, KEYFRAME, SETPOINT, TICK, JUMP, HEAD, JOURNAL, DIGEST, BLOCKS, DRONE_BLOCKS, PHASE, COMMAND,
