@@ -3,6 +3,9 @@
 Arrays travel as ``[dtype, shape, little-endian bytes]``. Whatever does not fit exactly - another major version, a
 wrong type, a wrong length, a number that is not finite - is refused with `MessageError`; nothing is guessed. Nor
 does a length that the bytes only claim cost memory or time before it is refused.
+
+Processes of different minor versions understand each other: a newer one may add fields, which an older one passes over
+and for which a newer one that does not find them takes their defaults.
 """
 
 from __future__ import annotations
@@ -20,7 +23,10 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSeriali
 from protocol.errors import MessageError, VersionError
 
 WIRE_VERSION = 1
-"""Major version; a new field with a default does not change it."""
+"""Major version. Whatever an older process would misunderstand changes it: a field that is gone, another meaning, a new
+value of an enumeration."""
+WIRE_MINOR = 0
+"""Of a major version; one more with each release that adds fields, which must have defaults."""
 MAX_MESSAGE_BYTES = 16 * 2**20
 MAX_MEMBERS = 2**12
 """Of one map or tuple; bulk travels as bytes."""
@@ -92,7 +98,8 @@ def encode(message: Message) -> bytes:
     Raises:
         MessageError: longer than any receiver accepts.
     """
-    packed: bytes = msgpack.packb({"v": WIRE_VERSION, "n": message.name, **message.__dict__}, default=_plain)
+    version = {"v": WIRE_VERSION, "m": WIRE_MINOR} if WIRE_MINOR else {"v": WIRE_VERSION}
+    packed: bytes = msgpack.packb({**version, "n": message.name, **message.__dict__}, default=_plain)
     if len(packed) > MAX_MESSAGE_BYTES:
         raise MessageError(f"{message.name}: {len(packed)} bytes exceed the limit of {MAX_MESSAGE_BYTES}")
     return packed
@@ -121,13 +128,15 @@ def decode(kind: type[M], data: bytes) -> M:
         raise MessageError(f"{kind.name}: not MessagePack: {error}") from error
     if not isinstance(fields, dict):
         raise MessageError(f"{kind.name}: not a map")
-    version, name = fields.pop("v", None), fields.pop("n", None)
+    version, minor, name = fields.pop("v", None), fields.pop("m", 0), fields.pop("n", None)
     if type(version) is not int or version != WIRE_VERSION:  # True and 1.0 equal 1
         raise VersionError(f"{kind.name}: wire version {reprlib.repr(version)}, this process speaks {WIRE_VERSION}")
+    if type(minor) is not int or minor < 0:
+        raise MessageError(f"{kind.name}: minor wire version {reprlib.repr(minor)}")
     if name != kind.name:
         raise MessageError(f"{kind.name}: holds a message {reprlib.repr(name)}")
     try:
-        return kind.model_validate(fields)
+        return kind.model_validate(fields, extra="ignore" if minor > WIRE_MINOR else "forbid")
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         place = ".".join(str(part)[:PLACE_LETTERS] for part in first["loc"])

@@ -36,7 +36,7 @@ from protocol.messages import (
     Tick,
     VehicleSample,
 )
-from protocol.wire import MAX_MEMBERS, MAX_MESSAGE_BYTES, WIRE_VERSION, Message, decode, encode
+from protocol.wire import MAX_MEMBERS, MAX_MESSAGE_BYTES, WIRE_MINOR, WIRE_VERSION, Message, decode, encode
 
 Place: TypeAlias = tuple[str | int, ...]
 
@@ -206,7 +206,7 @@ def test_no_message_is_missing_from_the_examples() -> None:
 
 
 def test_no_field_takes_the_place_of_the_version_or_the_name() -> None:
-    assert all(type(message).model_fields.keys().isdisjoint({"v", "n"}) for message in EXAMPLES)
+    assert all(type(message).model_fields.keys().isdisjoint({"v", "m", "n"}) for message in EXAMPLES)
 
 
 @each_message
@@ -237,6 +237,57 @@ def test_an_array_crosses_as_little_endian_bytes_whatever_its_own_order() -> Non
 def test_another_version_is_refused(version: object) -> None:
     with pytest.raises(VersionError, match=r"jump_head: wire version .* speaks 1"):
         decode(JumpHead, msgpack.packb(unpacked(EXAMPLES[7]) | {"v": version}))
+
+
+def newer(message: Message) -> bytes:
+    """As a release says it that is one minor version ahead and has a new field in everything."""
+    fields = _with_new_fields(unpacked(message))
+    packed: bytes = msgpack.packb(fields | {"v": WIRE_VERSION, "m": WIRE_MINOR + 1, "n": message.name})
+    return packed
+
+
+def _with_new_fields(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _with_new_fields(below) for key, below in value.items()} | {"new": [1, {"of": "later"}]}
+    if isinstance(value, list):
+        return [_with_new_fields(below) for below in value]
+    return value
+
+
+@each_message
+def test_fields_of_a_newer_minor_version_are_passed_over(message: Message) -> None:
+    assert_same(decode(type(message), newer(message)), message)
+
+
+def test_fields_that_nobody_knows_are_refused_of_the_same_minor_version() -> None:
+    for minor in ({}, {"m": WIRE_MINOR}):
+        with pytest.raises(MessageError, match=r"jump_head.new"):
+            decode(JumpHead, msgpack.packb(_with_new_fields(unpacked(EXAMPLES[7])) | minor))
+
+
+def test_an_older_minor_versions_message_takes_the_defaults_of_what_it_lacks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("protocol.wire.WIRE_MINOR", 3)
+    fields = unpacked(EXAMPLES[4])
+    assert fields.pop("m") == 3
+    del fields["obeyed"], fields["blind_s"]
+
+    found = decode(DroneState, msgpack.packb(fields))
+
+    assert (found.obeyed, found.blind_s) == (0, 0.0)
+
+
+@pytest.mark.parametrize("minor", [-1, True, 1.0, "1", None, [1]])
+def test_a_minor_version_that_is_no_number_is_refused(minor: object) -> None:
+    with pytest.raises(MessageError, match=r"jump_head: minor wire version"):
+        decode(JumpHead, msgpack.packb(unpacked(EXAMPLES[7]) | {"m": minor}))
+
+
+@pytest.mark.parametrize("field", ["epoch", "next_sequence"])
+def test_a_newer_minor_version_must_still_have_what_this_one_needs(field: str) -> None:
+    fields = unpacked(EXAMPLES[7]) | {"m": WIRE_MINOR + 1}
+    del fields[field]
+    with pytest.raises(MessageError, match=field):
+        decode(JumpHead, msgpack.packb(fields))
 
 
 def test_a_message_of_another_name_is_refused() -> None:
