@@ -17,6 +17,7 @@ from mavsdk.plugins.gimbal import ControlMode, GimbalError, GimbalMode, SendMode
 from mavsdk.plugins.telemetry import FlightMode, LandedState
 
 from faults.mavsdk_client import SET_MESSAGE_INTERVAL, Client, wait, watch
+from faults.ports import free_port
 from protocol.mission import Drone, Mission
 from protocol.vehicle_settings import Vehicles
 from sim_bridge.px4_endpoint.endpoint import Endpoint
@@ -37,12 +38,6 @@ HOLD_ON_LOSS = 5
 SPEED_MPS = 0.5
 
 
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 @pytest.fixture(scope="module", params=[OURS, *OTHERS])
 def backend(request: pytest.FixtureRequest) -> str:
     return str(request.param)
@@ -53,7 +48,7 @@ def url(backend: str) -> Iterator[str]:
     if backend != OURS:
         yield backend
         return
-    address = f"udpin://127.0.0.1:{free_port()}"
+    address = f"udpin://127.0.0.1:{free_port(socket.SOCK_DGRAM)}"
     mission = Mission(
         drones=(Drone(id=7, start=(1.0, 2.0, 2.0, 0.0, 1.3), url=address),),
         vehicles=Vehicles(kind="px4", origin=(47.4, 8.5, 400.0)),

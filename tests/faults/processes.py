@@ -25,6 +25,7 @@ from deploy.mission_run import compile_everything
 from deploy.run_folder import make_run_folder
 from faults.datagrams import DatagramLink, datagram_link
 from faults.monitor import Monitor
+from faults.ports import free_port
 from faults.proxy import Link, link
 from protocol.bus import connect
 from protocol.guard import ROOT
@@ -240,7 +241,7 @@ async def fly(
     ``linked``: who reaches the router by a link that can be made bad. ``late``: who is not started yet.
     """
     await asyncio.to_thread(_compile_once, mission)
-    port = _free_port(transport)
+    port = free_port(socket.SOCK_STREAM if transport == "tcp" else socket.SOCK_DGRAM)
     endpoint = f"{transport}/127.0.0.1:{port}"
     run = make_run_folder(folder, mission, datetime.now(UTC), endpoint)
     async with AsyncExitStack() as stack:
@@ -278,9 +279,3 @@ def _commands(mission: Mission, run: Path, endpoint: str, ways: dict[str, str]) 
         (role,) = (r for r in mission_roles(run, ways.get(name, endpoint), drones, "1", px4=px4) if r.name == name)
         commands[name] = tuple(simulator if word == "sim_bridge" else word for word in role.command)
     return commands
-
-
-def _free_port(transport: Transport) -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM if transport == "tcp" else socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 from collections.abc import Mapping
 from urllib.request import urlopen
 
@@ -28,11 +27,3 @@ def samples(text: str) -> dict[Series, float]:
 
 def series(name: str, labels: Mapping[str, str] | None = None) -> Series:
     return (name, frozenset((labels or {}).items()))
-
-
-def free_port() -> int:
-    """One that nobody listened at just now, on the loopback device."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port

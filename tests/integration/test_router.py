@@ -16,6 +16,7 @@ import pytest
 
 from deploy.local import environment
 from faults.datagrams import Loss, datagram_link
+from faults.ports import free_port
 from faults.proxy import Fault, Link, link
 from protocol import topics
 from protocol.bus import Bus, connect
@@ -47,12 +48,6 @@ def start(tmp_path: Path) -> Iterator[Start]:
     for router in started:
         router.kill()
         router.communicate()
-
-
-def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
-    with socket.socket(socket.AF_INET, kind) as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
 
 
 def head(number: int) -> JumpHead:

@@ -13,7 +13,8 @@ from prometheus_client import CollectorRegistry, generate_latest
 from pydantic import ValidationError
 
 from agents.agent_metrics import AgentMetrics
-from faults.scrape import Series, free_port, samples, scrape, series
+from faults.ports import free_port
+from faults.scrape import Series, samples, scrape, series
 from ground_station.ground_metrics import GroundMetrics
 from ground_station.recording.recorder import RecordingStatistics
 from protocol.messages import Control, DroneState, DroneStatus, ReplicaState, Status
