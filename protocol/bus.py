@@ -15,15 +15,16 @@ import asyncio
 import logging
 import threading
 from collections import Counter, deque
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from functools import partial
+from typing import Any, Protocol, TypeVar
 
 import zenoh
 
-from protocol.errors import BusError, MessageError, NoReply
-from protocol.session import errors_of, open_session
+from protocol.errors import BusError, MessageError, NoReply, VersionError
+from protocol.session import Link, errors_of, open_client, open_router
 from protocol.topics import Topic, alive_key
 from protocol.wire import Message, decode, encode
 
@@ -35,13 +36,17 @@ log = logging.getLogger(__name__)
 QUERY_TIMEOUT_S = 2.0
 
 
+class LinkWatcher(Protocol):
+    def __call__(self, address: str, name: str, *, there: bool) -> None: ...
+
+
 @dataclass(slots=True)
 class _Subscription:
     """One key's queue between zenoh's thread and the loop, and who reads it."""
 
     key: str
     topic: Topic[Any]
-    take: Callable[[], bytes | None]
+    take: Callable[[], zenoh.Sample | None]
     """The oldest message that waits."""
     handle: object
     """Kept because zenoh undeclares a subscriber that nobody refers to."""
@@ -51,7 +56,7 @@ class _Subscription:
 @dataclass(slots=True)
 class BusStatistics:
     refused: Counter[str] = field(default_factory=Counter)
-    """Messages that did not decode, by topic."""
+    """Messages that are too long, do not decode or speak for somebody else, by the key that they came under."""
     dropped: Counter[str] = field(default_factory=Counter)
     """Messages and questions that a full queue lost, by topic."""
     failed: Counter[str] = field(default_factory=Counter)
@@ -90,6 +95,8 @@ class Bus:
         """Roles that had one and lost it. Whoever is in neither set may live already: a token may come after what its
         process said."""
         self.statistics = BusStatistics()
+        self.foreign: dict[str, str] = {}
+        """Keys under which another major version speaks, each with what to tell people."""
 
     # --- sending -------------------------------------------------------------------------------------------------
 
@@ -129,12 +136,12 @@ class Bus:
         subscription.handlers.append(handler)
 
     def _declare_waking(self, key: str, topic: Topic[Any]) -> _Subscription:
-        queue: deque[bytes] = deque(maxlen=topic.queue)
+        queue: deque[zenoh.Sample] = deque(maxlen=topic.queue)
 
         def arrive(sample: zenoh.Sample) -> None:
             if len(queue) == topic.queue:
                 self.statistics.dropped[key] += 1
-            queue.append(sample.payload.to_bytes())
+            queue.append(sample)
             self._wake()
 
         handle = self._session.declare_subscriber(key, arrive, allowed_origin=zenoh.Locality.REMOTE)
@@ -143,12 +150,7 @@ class Bus:
     def _declare_ring(self, key: str, topic: Topic[Any]) -> _Subscription:
         ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(topic.queue)
         handle = self._session.declare_subscriber(key, ring, allowed_origin=zenoh.Locality.REMOTE)
-
-        def take() -> bytes | None:
-            sample = handle.try_recv()
-            return None if sample is None else sample.payload.to_bytes()
-
-        return _Subscription(key, topic, take, handle)
+        return _Subscription(key, topic, handle.try_recv, handle)
 
     async def until(self, condition: Callable[[], bool], timeout_s: float) -> bool:
         """Wait until ``condition`` holds, checked after each burst of messages; False when time ran out.
@@ -207,17 +209,18 @@ class Bus:
             (self.gone.discard if alive else self.gone.add)(role)
         for subscription in list(self._subscriptions.values()):
             for _ in range(subscription.topic.queue):
-                payload = subscription.take()
-                if payload is None:
+                sample = subscription.take()
+                if sample is None:
                     break
-                self._deliver(subscription, payload)
+                self._deliver(subscription, sample)
         self.recheck()
 
-    def _deliver(self, subscription: _Subscription, payload: bytes) -> None:
+    def _deliver(self, subscription: _Subscription, sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr)
         try:
-            message = decode(subscription.topic.message, payload)
-        except MessageError:
-            self.statistics.refused[subscription.key] += 1
+            message = _read(subscription.topic, key, sample.payload)
+        except MessageError as error:
+            self._refuse(key, error)
             return
         for handler in subscription.handlers:
             try:
@@ -225,8 +228,18 @@ class Bus:
             except Exception as error:  # noqa: BLE001 - a fault in one reader must not cost the others their messages
                 self._fail(subscription.key, error)
 
+    def _refuse(self, key: str, error: MessageError) -> None:
+        """Count, and log the 1st, 2nd, 4th, 8th ...: a storm of bad messages must not fill the disk."""
+        self.statistics.refused[key] += 1
+        count = self.statistics.refused[key]
+        if isinstance(error, VersionError) and not self.foreign.get(key):
+            self.foreign[key] = f"{key}: {error}: install the same release on both sides"
+            log.error("%s", self.foreign[key])
+        elif count.bit_count() == 1:
+            log.warning("%s: message %d refused: %s", key, count, error)
+
     def _fail(self, key: str, error: Exception) -> None:
-        """Count, and log the 1st, 2nd, 4th, 8th ...: a storm of failures must not fill the disk."""
+        """Likewise."""
         self.statistics.failed[key] += 1
         if self.statistics.failed[key].bit_count() == 1:
             log.error("%s: failure %d", key, self.statistics.failed[key], exc_info=error)
@@ -249,6 +262,21 @@ class Bus:
 
         with errors_of(alive_key("**")):
             self._declared.append(self._session.liveliness().declare_subscriber(alive_key("**"), change, history=True))
+
+    def watch_links(self, told: LinkWatcher) -> None:
+        """Have ``told`` called, in the loop, with the address and the certificate's common name of each link that comes
+        or goes."""
+
+        def change(event: zenoh.LinkEvent) -> None:
+            there = event.kind == zenoh.SampleKind.PUT
+            name = event.link.auth_identifier or "somebody without a certificate"
+            try:
+                self._loop.call_soon_threadsafe(partial(told, str(event.link.dst), name, there=there))
+            except RuntimeError:  # closed
+                return
+
+        with errors_of("links"):
+            self._declared.append(self._session.info.declare_link_events_listener(change, history=True))
 
     # --- queries -------------------------------------------------------------------------------------------------
 
@@ -311,7 +339,7 @@ class Bus:
             NoReply: nobody answered in time; with zenoh an empty answer is no "no", so ask again.
         """
         key = topic.of(drone)
-        replies: list[bytes] = []
+        replies: list[zenoh.Sample] = []
         done: asyncio.Future[None] = self._loop.create_future()
 
         def post(action: Callable[..., object], *arguments: object) -> None:
@@ -322,7 +350,7 @@ class Bus:
 
         def arrive(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
-                post(replies.append, reply.ok.payload.to_bytes())
+                post(replies.append, reply.ok)
 
         def finish() -> None:
             post(_settle, done, None)
@@ -337,11 +365,11 @@ class Bus:
                 priority=getattr(zenoh.Priority, topic.priority),
             )
         await done
-        for payload in replies:
+        for sample in replies:
             try:
-                return decode(topic.message, payload)
-            except MessageError:
-                self.statistics.refused[key] += 1
+                return _read(topic, key, sample.payload)
+            except MessageError as error:
+                self._refuse(key, error)
         raise NoReply(f"{key}?{parameters}: no valid answer")
 
     async def close(self) -> None:
@@ -359,22 +387,35 @@ class Bus:
 
 @asynccontextmanager
 async def connect(
-    endpoint: str,
+    link: Link | str,
     mission: str,
     *,
     router: bool = False,
     lossless: bool = False,
     timeout_s: float = 30.0,
+    uplinks: Sequence[str] = (),
+    access: dict[str, Any] | None = None,
 ) -> AsyncIterator[Bus]:
-    """A bus in the namespace of ``mission``; the router listens at ``endpoint``, everybody else connects to it.
+    """A bus in the namespace of ``mission``; the router listens at the link's endpoint, everybody else connects to it.
 
     A client waits up to ``timeout_s`` for the router to appear. ``lossless`` makes every put wait for a congested
     link instead of dropping: for lockstep simulation, where a lost message would change the outcome.
 
+    Args:
+        link: a bare endpoint is one without alternatives and credentials.
+        uplinks: endpoints of other routers that a router connects to.
+        access: of a router, whom it lets do what (`protocol.access`).
+
     Raises:
-        BusError: the endpoint is malformed, taken, or nobody listened in time.
+        BusError: the endpoint is malformed, taken or open to strangers, or nobody listened in time.
     """
-    bus = Bus(await open_session(endpoint, mission, router=router, timeout_s=timeout_s), lossless=lossless)
+    if isinstance(link, str):
+        link = Link(link)
+    if router:
+        session = await open_router(link, mission, uplinks=uplinks, access=access)
+    else:
+        session = await open_client(link, mission, timeout_s=timeout_s)
+    bus = Bus(session, lossless=lossless)
     try:
         yield bus
     finally:
@@ -384,6 +425,17 @@ async def connect(
 def parse_parameters(selector: str) -> dict[str, str]:
     """``"from=3;to=9"`` as a dictionary."""
     return {key: value for key, _, value in (part.partition("=") for part in selector.split(";")) if key}
+
+
+def _read(topic: Topic[M], key: str, payload: zenoh.ZBytes) -> M:
+    """Raises `MessageError` for what must not be believed."""
+    if len(payload) > topic.max_bytes:
+        raise MessageError(f"{topic.message.name}: {len(payload)} bytes exceed the limit of {topic.max_bytes}")
+    message = decode(topic.message, payload.to_bytes())
+    contradiction = topic.contradiction(key, message)
+    if contradiction:
+        raise MessageError(f"{topic.message.name}: {contradiction}")
+    return message
 
 
 def _drop(query: zenoh.Query) -> None:

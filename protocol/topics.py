@@ -43,6 +43,18 @@ class Topic(Generic[M]):
         """The key of one drone, or of all with ``"*"``."""
         return self.key.format(drone=drone)
 
+    def contradiction(self, key: str, message: Message) -> str:
+        """How ``message`` speaks for another drone than the one whose key it came under; empty if it does not.
+
+        Access control judges keys alone, so that a drone could write its neighbour's position under its own.
+        """
+        before, mark, after = self.key.partition("{drone}")
+        if not mark:
+            return ""
+        drone = key.removeprefix(before).removesuffix(after)
+        claimed = message.source if isinstance(message, messages.Event) else f"drone/{getattr(message, 'drone', drone)}"
+        return "" if claimed == f"drone/{drone}" else f"speaks for {claimed}"
+
 
 _NO_AGE = float("inf")
 

@@ -43,6 +43,9 @@ class Payload:
     def to_bytes(self) -> bytes:
         return self.content
 
+    def __len__(self) -> int:
+        return len(self.content)
+
 
 @dataclass(frozen=True, slots=True)
 class Sample:

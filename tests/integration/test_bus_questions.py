@@ -17,7 +17,9 @@ from protocol.messages import JournalPage, Jump
 from protocol.topics import Topic
 from protocol.wire import MAX_MESSAGE_BYTES, encode
 
-PRIVATE = Topic("drone/{drone}/private", JournalPage, "agent", "BACKGROUND", 4, 1.0, False, queryable=True)
+PRIVATE = Topic(
+    "drone/{drone}/private", JournalPage, ("agent",), ("agent",), "BACKGROUND", 4, 1.0, False, 2**20, queryable=True
+)
 
 
 async def test_a_question_is_answered_in_the_loop_with_its_parameters(ground: Bus, drone: Bus) -> None:

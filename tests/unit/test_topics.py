@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import zenoh
 
 from protocol import messages, topics
 from protocol.topics import TOPICS, Topic, alive_key
-from protocol.wire import Message
+from protocol.wire import MAX_MESSAGE_BYTES, Message
 
 each_topic = pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.key)
 
@@ -65,3 +66,28 @@ def test_a_key_is_that_of_one_drone_or_of_all(topic: Topic[Message]) -> None:
     assert topic.of("*") == topic.key.replace("{drone}", "*")
     for key in (topic.of(3), topic.of("*")):
         zenoh.KeyExpr(key)  # refuses what is not canonical
+
+
+@each_topic
+def test_a_topic_has_somebody_who_writes_and_somebody_who_reads_it(topic: Topic[Message]) -> None:
+    assert topic.writers
+    assert topic.readers
+
+
+@each_topic
+def test_a_topics_messages_are_bounded_and_no_longer_than_any_message_may_be(topic: Topic[Message]) -> None:
+    assert 0 < topic.max_bytes <= MAX_MESSAGE_BYTES
+
+
+def test_who_speaks_for_another_drone_than_its_keys_is_found() -> None:
+    event = messages.Event(source="drone/3", tick=1, level="info", kind="mode", text="x")
+    setpoint = messages.Setpoint(drone=3, tick=1, velocity=(0.0, 0.0, 0.0, 0.0, 0.0))
+    page = messages.PhiPage(
+        epoch=1, tick=1, next_sequence=0, blocks=np.zeros(0, np.int32), phi=np.zeros((0, 1), np.float32)
+    )
+    assert topics.EVENT.contradiction("drone/3/event", event) == ""
+    assert topics.EVENT.contradiction("drone/2/event", event) == "speaks for drone/3"
+    assert topics.SETPOINT.contradiction("drone/3/setpoint", setpoint) == ""
+    assert topics.SETPOINT.contradiction("drone/33/setpoint", setpoint) == "speaks for drone/3"
+    assert topics.DRONE_BLOCKS.contradiction("drone/2/phi", page) == "", "it speaks for nobody"
+    assert topics.GROUND_EVENT.contradiction("ground/event", event) == "", "not a drone's key"
