@@ -9,7 +9,7 @@ from protocol.process import Arguments, run_process
 
 
 async def main(arguments: Arguments) -> None:
-    await run_agent(arguments.mission, arguments.drone, arguments.endpoint, lockstep=arguments.lockstep)
+    await run_agent(arguments.mission, arguments.drone, arguments.link, lockstep=arguments.lockstep)
 
 
 if __name__ == "__main__":

@@ -40,6 +40,7 @@ from protocol.metrics_endpoint import MetricsEndpoint
 from protocol.mission import Mission
 from protocol.news import News
 from protocol.replication import Replication
+from protocol.session import Link
 from protocol.synchroniser import Synchroniser, blocks_of
 
 log = logging.getLogger(__name__)
@@ -358,11 +359,11 @@ class Agent:
         )
 
 
-async def run_agent(mission: Mission, drone: int, endpoint: str, *, lockstep: bool) -> None:
+async def run_agent(mission: Mission, drone: int, link: Link, *, lockstep: bool) -> None:
     """Fly one drone of ``mission`` until it ends."""
     compile_kernels()
     CoverageController(mission, neighbours=1).rehearse()
     with MetricsEndpoint(mission, "agent", drone) as served:
         metrics = AgentMetrics(served.registry)
-        async with connect(endpoint, mission.name, lossless=lockstep) as bus:
+        async with connect(link, mission.name, lossless=lockstep) as bus:
             await Agent(mission, drone, bus, lockstep=lockstep, metrics=metrics).fly()

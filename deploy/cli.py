@@ -19,7 +19,7 @@ from deploy.doctor_command import doctor
 from deploy.export_command import export_app
 from deploy.recording_command import recording_app
 from deploy.replay_command import replay
-from protocol.errors import CovreconError, MissionError, SceneError
+from protocol.errors import CovreconError, CredentialsError, MissionError, SceneError
 from protocol.guard import require_own_packages
 from protocol.verbs import Verb
 
@@ -54,7 +54,7 @@ def main() -> NoReturn:
     try:
         require_own_packages()
         result = app(result_action="return_value")
-    except (MissionError, SceneError) as error:
+    except (MissionError, SceneError, CredentialsError) as error:
         print(error, file=sys.stderr)
         sys.exit(2)
     except CovreconError as error:
@@ -180,6 +180,8 @@ def command(
     *,
     drone: Annotated[tuple[int, ...], Parameter(help="Only this one; may be repeated. All without.")] = (),
     run: Annotated[Path, Parameter(help="The folder of the run that flies.")] = Path("runs/latest"),
+    mission: Annotated[Path | None, Parameter(help="Instead of a run: the mission file, on another computer.")] = None,
+    operator: Annotated[str, Parameter(help="Whose certificate to show, where there are several.")] = "",
     patience: Annotated[float, Parameter(help="Seconds to wait for all acknowledgements.")] = 10.0,
 ) -> None:
     """Command a mission that flies, and wait until every drone has acknowledged it.
@@ -191,14 +193,16 @@ def command(
     covrecon command pause
     covrecon command land --drone 3
     covrecon command return --drone 1 --drone 4 --run runs/2026-08-01T09-30-00Z
+    covrecon command pause --mission fleet.toml --operator anna   # from a laptop with a certificate
     ```
     """
     import asyncio
 
     from deploy.command_client import command as insist
-    from deploy.command_client import place_of
+    from deploy.command_client import place_of, place_of_mission
 
-    asyncio.run(insist(place_of(run), verb, drone, say=print, patience_s=patience))
+    place = place_of(run) if mission is None else place_of_mission(mission, operator)
+    asyncio.run(insist(place, verb, drone, say=print, patience_s=patience))
 
 
 @mission_app.command

@@ -11,8 +11,12 @@ from pathlib import Path
 
 from protocol import topics
 from protocol.bus import Bus, connect
-from protocol.errors import BusError, CommandError, NoReply
+from protocol.credentials import OPERATOR
+from protocol.errors import BusError, CommandError, MissionError, NoReply
+from protocol.links import link_of
 from protocol.messages import CommandReply
+from protocol.mission_file import load_mission
+from protocol.session import Link
 from protocol.verbs import ASK_AGAIN_S, ASK_TIMEOUT_S, Verb, command_parameters
 
 CONNECT_S = 5.0
@@ -23,7 +27,7 @@ CONNECT_S = 5.0
 class Place:
     """Where a mission can be reached."""
 
-    endpoint: str
+    link: Link
     mission: str
 
 
@@ -32,14 +36,30 @@ def place_of(run: Path) -> Place:
 
     Raises:
         CommandError: it is no run's folder.
+        CredentialsError: its endpoint wants a certificate, and there is none of an operator.
     """
     try:
-        endpoint = json.loads((run / "run.json").read_bytes())["endpoint"]
-        mission = json.loads((run / "mission.json").read_bytes())["name"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        endpoint = str(json.loads((run / "run.json").read_bytes())["endpoint"])
+        mission = load_mission(run / "mission.json")
+    except (OSError, ValueError, KeyError, TypeError, MissionError) as error:
         why = error.strerror if isinstance(error, OSError) else str(error)
         raise CommandError(f"{run}: not the folder of a run ({why}); name it: --run runs/<time>") from error
-    return Place(str(endpoint), str(mission))
+    return Place(link_of(mission, OPERATOR, endpoint=endpoint), mission.name)
+
+
+def place_of_mission(file: Path, operator: str = "") -> Place:
+    """Of the mission of a fleet, from any computer with an operator's certificate.
+
+    Args:
+        operator: whose certificate to show; empty where there is only one.
+
+    Raises:
+        MissionError: it cannot be read.
+        BusError: it does not say where its router is.
+        CredentialsError: there is no certificate of an operator.
+    """
+    mission = load_mission(file)
+    return Place(link_of(mission, f"{OPERATOR}-{operator}" if operator else OPERATOR), mission.name)
 
 
 async def command(
@@ -51,7 +71,7 @@ async def command(
         CommandError: refused, or not acknowledged by everybody within ``patience_s``; it may still be obeyed then.
     """
     try:
-        async with connect(place.endpoint, place.mission, timeout_s=CONNECT_S) as bus:
+        async with connect(place.link, place.mission, timeout_s=CONNECT_S) as bus:
             await _insist(bus, verb, drones, say, patience_s)
     except BusError as error:
         raise CommandError(f"{error}; does mission {place.mission!r} still fly?") from error

@@ -15,7 +15,9 @@ from rich.table import Table
 from rich.text import Text
 
 from protocol.bus import connect
-from protocol.errors import BusError
+from protocol.credentials import OPERATOR
+from protocol.errors import BusError, CredentialsError
+from protocol.links import link_of
 from protocol.messages import DroneStatus, Status
 from protocol.mission import Mission
 from protocol.topics import STATUS
@@ -36,10 +38,11 @@ class Display(Protocol):
 async def follow(endpoint: str, mission: Mission, display: Display) -> None:
     """Show the ground station's status until cancelled. A run that cannot be watched goes on unwatched, and says so."""
     try:
-        async with connect(endpoint, mission.name, timeout_s=CONNECT_S) as bus:
+        link = link_of(mission, OPERATOR, endpoint=endpoint)
+        async with connect(link, mission.name, timeout_s=CONNECT_S) as bus:
             bus.on(STATUS, display.show)
             await asyncio.Event().wait()
-    except BusError as error:
+    except (BusError, CredentialsError) as error:
         display.say(f"no progress to show: {error}")
 
 

@@ -9,7 +9,7 @@ from protocol.process import Arguments, run_process
 
 
 async def main(arguments: Arguments) -> None:
-    await run_ground_station(arguments.mission, arguments.endpoint, arguments.run, lockstep=arguments.lockstep)
+    await run_ground_station(arguments.mission, arguments.link, arguments.run, lockstep=arguments.lockstep)
 
 
 if __name__ == "__main__":

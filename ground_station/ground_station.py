@@ -39,6 +39,7 @@ from protocol.metrics_endpoint import MetricsEndpoint
 from protocol.mission import Mission
 from protocol.news import News
 from protocol.replication import Integrated, Replication
+from protocol.session import Link
 from protocol.synchroniser import Synchroniser, blocks_of
 
 log = logging.getLogger(__name__)
@@ -90,6 +91,8 @@ class GroundStation:
         self._tick = 0
         self._promised = 0
         self._outdated = ""
+        self._foreign: set[str] = set()
+        """Keys of which it was told that another major version speaks there."""
         bus.on(topics.TICK, self._replication.hear_tick)
         bus.on(topics.STATE, self._hear_state, wakes=lockstep)
         bus.on(topics.KEYFRAME, self._feedback.hear)
@@ -248,7 +251,13 @@ class GroundStation:
         while True:
             self._publish_status()
             self._publish_phase()
+            self._tell_of_foreign_versions()
             await asyncio.sleep(STATUS_PERIOD_S)
+
+    def _tell_of_foreign_versions(self) -> None:
+        for key in self._bus.foreign.keys() - self._foreign:
+            self._foreign.add(key)
+            self._news.tell("error", "link", self._bus.foreign[key])
 
     def _publish_status(self) -> None:
         status = self._board.status(
@@ -334,7 +343,7 @@ def _recorder(mission: Mission, folder: Path, *, lockstep: bool) -> Recorder:
     )
 
 
-async def run_ground_station(mission: Mission, endpoint: str, folder: Path, *, lockstep: bool) -> None:
+async def run_ground_station(mission: Mission, link: Link, folder: Path, *, lockstep: bool) -> None:
     """Be the ground station of ``mission``; results go to ``folder``."""
     run = RunFolder(folder, mission)
     served = MetricsEndpoint(mission, "ground")
@@ -345,7 +354,7 @@ async def run_ground_station(mission: Mission, endpoint: str, folder: Path, *, l
         journal = open_journal(folder / JOURNAL_FILE)
         with KeyframeLog(folder / KEYFRAMES_FILE) as keyframes, CommandLog(folder / COMMANDS_FILE) as commands:
             mapper = Mapper(mission, VirtualField.of(mission.target), folder, keyframes)
-            async with connect(endpoint, mission.name, lossless=lockstep) as bus:
+            async with connect(link, mission.name, lossless=lockstep) as bus:
                 with _recorder(mission, folder, lockstep=lockstep) as recorder:
                     await GroundStation(
                         mission,

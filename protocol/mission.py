@@ -347,6 +347,7 @@ class Mission(Settings):
                 for index, drone in enumerate(self.drones)
                 if drone.camera
             ]
+        faults += self.transport.faults()
         if self.reconstruction.nearest_m >= self.reconstruction.farthest_m:
             faults.append("reconstruction.nearest_m: must be less than farthest_m")
         if faults:

@@ -13,14 +13,25 @@ from pathlib import Path
 
 import uvloop
 
-from protocol.errors import BusError, CovreconError, MissionError, SceneError, VehicleError
+from protocol.credentials import GROUND, OPERATOR, ROUTER, SIM, identity_of_drone
+from protocol.errors import BusError, CovreconError, CredentialsError, MissionError, SceneError, VehicleError
 from protocol.guard import require_own_packages
+from protocol.links import link_of
 from protocol.logs import configure, say_last
 from protocol.mission import Mission
 from protocol.mission_file import load_mission
+from protocol.session import Link
 
 DONE, FAILED, BAD_INPUT, TERMINATED = 0, 1, 2, 143
-"""Exit codes; BAD_INPUT means that the mission, the scene or the endpoint is to be mended."""
+"""Exit codes; BAD_INPUT means that the mission, the scene, the endpoint or a certificate is to be mended."""
+
+IDENTITIES = {
+    "protocol.router": ROUTER,
+    "ground_station": GROUND,
+    "sim_bridge": SIM,
+    "ground_station.console": OPERATOR,
+}
+"""Who each kind of process is, by its module; an agent is its drone."""
 
 log = logging.getLogger(__name__)
 
@@ -28,7 +39,8 @@ log = logging.getLogger(__name__)
 @dataclass(frozen=True, slots=True)
 class Arguments:
     mission: Mission
-    endpoint: str
+    link: Link
+    """How it reaches the others."""
     run: Path
     """The run's folder: what this process leaves behind goes there."""
     lockstep: bool
@@ -41,10 +53,12 @@ def parse(role: str, arguments: list[str] | None = None) -> Arguments:
 
     Raises:
         MissionError: the mission cannot be flown.
+        CredentialsError: it needs a certificate and has none that is good.
+        BusError: nobody says where the router is.
     """
     parser = argparse.ArgumentParser(prog=f"python -m {role}")
     parser.add_argument("--mission", type=Path, required=True, help="mission file, TOML or JSON")
-    parser.add_argument("--endpoint", required=True, help="zenoh endpoint of the router")
+    parser.add_argument("--endpoint", default="", help="zenoh endpoint of the router, instead of the mission's")
     parser.add_argument("--run", type=Path, required=True, help="folder for results and logs")
     parser.add_argument("--speed", choices=("max", "1"), default="1", help="max: lockstep; 1: real time")
     if role == "agents":
@@ -55,7 +69,9 @@ def parse(role: str, arguments: list[str] | None = None) -> Arguments:
     if role == "agents" and drone not in {known.id for known in mission.drones}:
         raise MissionError([f"{parsed.mission}: drones: there is no drone {drone}"])
     lockstep = parsed.speed == "max" and mission.vehicles.kind == "simulated"  # nothing makes a PX4 wait
-    return Arguments(mission, parsed.endpoint, parsed.run, lockstep, drone)
+    identity = IDENTITIES.get(role) or identity_of_drone(drone)
+    link = link_of(mission, identity, endpoint=parsed.endpoint)
+    return Arguments(mission, link, parsed.run, lockstep, drone)
 
 
 def run_process(role: str, body: Callable[[Arguments], Coroutine[None, None, None]]) -> int:
@@ -68,7 +84,7 @@ def run_process(role: str, body: Callable[[Arguments], Coroutine[None, None, Non
         configure(role, arguments.mission.name, arguments.drone)
         # An eighth less CPU a tick than asyncio's own loop, in lockstep where a tick is nothing but messages.
         return uvloop.run(_until_signal(body(arguments)))
-    except (MissionError, SceneError, BusError) as error:
+    except (MissionError, SceneError, BusError, CredentialsError) as error:
         say_last(error)
         return BAD_INPUT
     except VehicleError as error:  # the vehicle's fault: where it was noticed in the program helps nobody

@@ -6,6 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
+from protocol.endpoints import why_refused
 from protocol.settings import Settings
 
 
@@ -24,3 +25,11 @@ class Transport(Settings):
     aggregate_above: Annotated[int, Field(ge=0, le=255)] = 8
     """With more drones than this the router gathers the team's states, so that each drone hears one message a tick
     instead of one from every other; 0: always."""
+
+    def faults(self) -> list[str]:
+        """Endpoints that strangers could reach, each with its key and what to do."""
+        places = {"endpoint": self.endpoint}
+        places |= {f"alternatives.{index}": place for index, place in enumerate(self.alternatives)}
+        places |= {f"uplinks.{index}": place for index, place in enumerate(self.uplinks)}
+        reasons = {key: why_refused(place, certified=bool(self.credentials)) for key, place in places.items()}
+        return [f"transport.{key}: {places[key]} {reason}" for key, reason in reasons.items() if reason]

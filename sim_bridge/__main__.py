@@ -9,7 +9,7 @@ from sim_bridge.simulator import run_simulator
 
 
 async def main(arguments: Arguments) -> None:
-    await run_simulator(arguments.mission, arguments.endpoint, arguments.run, lockstep=arguments.lockstep)
+    await run_simulator(arguments.mission, arguments.link, arguments.run, lockstep=arguments.lockstep)
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ from protocol.errors import ProcessError
 from protocol.messages import Setpoint, Tick, VehicleSample
 from protocol.metrics_endpoint import MetricsEndpoint
 from protocol.mission import Mission
+from protocol.session import Link
 from sim_bridge.darkroom import Darkroom
 from sim_bridge.dynamics import VehicleBody
 from sim_bridge.observer import Observer
@@ -170,12 +171,12 @@ class Simulator:
             raise ProcessError(f"the ground station has been gone for {patience_s:g} s")
 
 
-async def run_simulator(mission: Mission, endpoint: str, run: Path, *, lockstep: bool) -> None:
+async def run_simulator(mission: Mission, link: Link, run: Path, *, lockstep: bool) -> None:
     """Simulate the world of ``mission``, or what its cameras see where autopilots fly; what is true of it is left in
     the run folder."""
     photographer = await asyncio.to_thread(_make_photographer, mission, run)
     with MetricsEndpoint(mission, "sim"):
-        async with connect(endpoint, mission.name, lossless=lockstep) as bus:
+        async with connect(link, mission.name, lossless=lockstep) as bus:
             if mission.vehicles.kind == "px4":
                 await Observer(mission, bus, photographer).run()
             else:

@@ -23,6 +23,7 @@ from protocol.importance import compile_kernels
 from protocol.messages import DroneState
 from protocol.mission import Mission
 from protocol.replication import Replication
+from protocol.session import Link
 from protocol.synchroniser import Synchroniser
 
 log = logging.getLogger(__name__)
@@ -118,18 +119,18 @@ class Console:
                 log.exception("drawing failed %d times so far", self._failures)
 
 
-async def run_console(mission: Mission, endpoint: str, run: Path, *, lockstep: bool) -> None:
+async def run_console(mission: Mission, link: Link, run: Path, *, lockstep: bool) -> None:
     """Show ``mission`` in browsers until cancelled.
 
     Raises:
-        BusError: the page's address is taken, or nobody listens at ``endpoint``.
+        BusError: the page's address is taken, or nobody listens where ``link`` leads.
         ProcessError: this viser cannot be guarded.
     """
     logging.getLogger("websockets.server").setLevel(logging.WARNING)  # it tells of each page that it sends
     compile_kernels()
     async with AsyncExitStack() as stack:
         server = stack.enter_context(serving(mission.console, f"covrecon · {mission.name}", run))
-        bus = await stack.enter_async_context(connect(endpoint, mission.name))
+        bus = await stack.enter_async_context(connect(link, mission.name))
         situation = Situation(mission, asyncio.get_running_loop().time)
         page = Page(server, mission, bus, situation)
         stack.push_async_callback(page.close)

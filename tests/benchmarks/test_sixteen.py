@@ -6,6 +6,7 @@ nominal instant: the earliest arrival of any tick fixes the simulator's clock to
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -24,7 +25,7 @@ import zenoh
 from deploy.run_folder import socket_endpoint, socket_folder_parent
 from protocol import topics
 from protocol.messages import DroneState, Setpoint, Status, Tick
-from protocol.session import configuration
+from protocol.session import Link, configuration
 from protocol.wire import Message, decode
 
 Record = Callable[..., None]
@@ -81,9 +82,10 @@ Heard = list[tuple[str, float, bytes]]
 def observer(endpoint: str, heard: Heard) -> Iterator[None]:
     """Hear the flight as soon as there is a router."""
     deadline = time.monotonic() + START_LIMIT_S
+    told = json.dumps(configuration("client", Link(endpoint), "sixteen"))
     while True:
         try:
-            session = zenoh.open(configuration("client", endpoint, "covrecon/sixteen"))
+            session = zenoh.open(zenoh.Config.from_json5(told))
             break
         except zenoh.ZError:
             assert time.monotonic() < deadline

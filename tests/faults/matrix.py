@@ -28,7 +28,7 @@ from faults.processes import START_S, STOP_BELOW, Flight, HarnessError, Transpor
 from faults.proxy import Fault as Slow
 from ground_station.checkpoint import CHECKPOINT_FILE
 from ground_station.journal import JOURNAL_FILE
-from protocol.session import open_session
+from protocol.session import Link, open_client
 from protocol.topics import TOPICS
 
 TEAMS = (1, 4)
@@ -201,7 +201,7 @@ async def rubbish(flight: Flight) -> Figures:
 
 @asynccontextmanager
 async def _rogue(flight: Flight) -> AsyncIterator[zenoh.Session]:
-    session = await open_session(flight.endpoint, flight.mission.name, router=False, timeout_s=START_S)
+    session = await open_client(Link(flight.endpoint), flight.mission.name, timeout_s=START_S)
     try:
         yield session
     finally:

@@ -19,6 +19,7 @@ from protocol.bus import Bus, connect
 from protocol.errors import CommandError
 from protocol.messages import CommandReply
 from protocol.mission import Mission
+from protocol.session import Link
 from protocol.verbs import Verb
 
 pytestmark = pytest.mark.light
@@ -49,12 +50,12 @@ def mission(tmp_path: Path) -> Mission:
 
 @pytest.fixture
 async def place(tmp_path: Path, mission: Mission) -> Place:
-    return Place(socket_endpoint(tmp_path), mission.name)
+    return Place(Link(socket_endpoint(tmp_path)), mission.name)
 
 
 @pytest.fixture
 async def bus(place: Place) -> AsyncIterator[Bus]:
-    async with connect(place.endpoint, place.mission, router=True) as bus:
+    async with connect(place.link, place.mission, router=True) as bus:
         yield bus
 
 
@@ -92,7 +93,7 @@ async def test_a_refusal_is_an_error_with_its_reason(ground: Ground, place: Plac
 
 
 async def test_the_same_id_is_the_same_command(ground: Ground, place: Place) -> None:
-    async with connect(place.endpoint, place.mission) as operator:
+    async with connect(place.link, place.mission) as operator:
         question = "id=a1;verb=pause;drones=1"
         answers: list[CommandReply] = await asyncio.gather(
             *(operator.ask(topics.COMMAND, question, timeout_s=PATIENCE_S) for _ in range(5))

@@ -14,6 +14,7 @@ import pytest
 from deploy.command_client import Place, command
 from faults.px4_flight import HOME_M, PATIENCE_S, FlownDrone, px4_flight, px4_mission
 from protocol.errors import CommandError
+from protocol.session import Link
 from protocol.verbs import Verb
 from sim_bridge.px4_endpoint.endpoint import Endpoint
 
@@ -164,7 +165,7 @@ async def test_an_operator_pauses_returns_and_lands_drones(tmp_path: Path) -> No
     """operator: pause, operator: return, operator: land; and a ground station that is killed in between."""
     async with px4_flight(px4_mission(tmp_path, 3), tmp_path) as flight:
         returning, landing, other = flight.drones.values()
-        place = Place(flight.processes.endpoint, flight.processes.mission.name)
+        place = Place(Link(flight.processes.endpoint), flight.processes.mission.name)
 
         async def order(verb: Verb, *drones: FlownDrone) -> None:
             await command(place, verb, [drone.id for drone in drones], say=lambda _: None, patience_s=PATIENCE_S)
