@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -122,6 +123,7 @@ class Agent:
         self._finished = ""
         self.mode: Mode = "starting"
         """As its newest state says."""
+        bus.on_foreign(partial(self._news.tell, "error", "link"))
         bus.on(topics.TICK, self._replication.hear_tick)
         bus.on(topics.STATE, self._hear_state, wakes=lockstep)
         bus.on(topics.JUMP, self._replication.hear_jump)

@@ -91,8 +91,7 @@ class GroundStation:
         self._tick = 0
         self._promised = 0
         self._outdated = ""
-        self._foreign: set[str] = set()
-        """Keys of which it was told that another major version speaks there."""
+        bus.on_foreign(partial(self._news.tell, "error", "link"))
         bus.on(topics.TICK, self._replication.hear_tick)
         bus.on(topics.STATE, self._hear_state, wakes=lockstep)
         bus.on(topics.KEYFRAME, self._feedback.hear)
@@ -251,13 +250,7 @@ class GroundStation:
         while True:
             self._publish_status()
             self._publish_phase()
-            self._tell_of_foreign_versions()
             await asyncio.sleep(STATUS_PERIOD_S)
-
-    def _tell_of_foreign_versions(self) -> None:
-        for key in self._bus.foreign.keys() - self._foreign:
-            self._foreign.add(key)
-            self._news.tell("error", "link", self._bus.foreign[key])
 
     def _publish_status(self) -> None:
         status = self._board.status(

@@ -95,8 +95,9 @@ class Bus:
         """Roles that had one and lost it. Whoever is in neither set may live already: a token may come after what its
         process said."""
         self.statistics = BusStatistics()
-        self.foreign: dict[str, str] = {}
-        """Keys under which another major version speaks, each with what to tell people."""
+        self._foreign: set[str] = set()
+        """Keys under which another major version speaks."""
+        self._tell_foreign: Callable[[str], None] = log.error
 
     # --- sending -------------------------------------------------------------------------------------------------
 
@@ -151,6 +152,10 @@ class Bus:
         ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(topic.queue)
         handle = self._session.declare_subscriber(key, ring, allowed_origin=zenoh.Locality.REMOTE)
         return _Subscription(key, topic, handle.try_recv, handle)
+
+    def on_foreign(self, tell: Callable[[str], None]) -> None:
+        """Have people told by ``tell``, once for each key, that another major version speaks there; else it is logged."""
+        self._tell_foreign = tell
 
     async def until(self, condition: Callable[[], bool], timeout_s: float) -> bool:
         """Wait until ``condition`` holds, checked after each burst of messages; False when time ran out.
@@ -232,9 +237,9 @@ class Bus:
         """Count, and log the 1st, 2nd, 4th, 8th ...: a storm of bad messages must not fill the disk."""
         self.statistics.refused[key] += 1
         count = self.statistics.refused[key]
-        if isinstance(error, VersionError) and not self.foreign.get(key):
-            self.foreign[key] = f"{key}: {error}: install the same release on both sides"
-            log.error("%s", self.foreign[key])
+        if isinstance(error, VersionError) and key not in self._foreign:
+            self._foreign.add(key)
+            self._tell_foreign(f"{key}: {error}: install the same release on both sides")
         elif count.bit_count() == 1:
             log.warning("%s: message %d refused: %s", key, count, error)
 

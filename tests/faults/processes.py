@@ -157,20 +157,21 @@ class Flight:
     links: dict[str, Link]
     datagram_links: dict[str, DatagramLink]
     monitor: Monitor = field(init=False)
-    _commands: dict[str, tuple[str, ...]]
+    commands: dict[str, tuple[str, ...]]
+    """What each is started by."""
     _group: int
     _running: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
 
     @property
     def drones(self) -> list[str]:
-        return [name for name in self._commands if name.startswith("drone-")]
+        return [name for name in self.commands if name.startswith("drone-")]
 
     def start(self, name: str) -> None:
         if self.code(name) is None and name in self._running:
             raise HarnessError(f"{name} still runs")
         with (self.run / "logs" / f"{name}.log").open("ab") as log:
             self._running[name] = subprocess.Popen(
-                self._commands[name],
+                self.commands[name],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
