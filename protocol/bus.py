@@ -154,7 +154,7 @@ class Bus:
         return _Subscription(key, topic, handle.try_recv, handle)
 
     def on_foreign(self, tell: Callable[[str], None]) -> None:
-        """Have people told by ``tell``, once for each key, that another major version speaks there; else it is logged."""
+        """Have ``tell`` tell people, once for each key, that another major version speaks there; else it is logged."""
         self._tell_foreign = tell
 
     async def until(self, condition: Callable[[], bool], timeout_s: float) -> bool:

@@ -68,7 +68,7 @@ class Refusals:
         count = self.counts[kind]
         if count.bit_count() != 1:
             return ""
-        return text if count == 1 else f"{text} (the {count}th time)"
+        return text if count == 1 else f"{text} (time {count})"
 
     def read(self, line: str) -> str:
         """What one line means, every time; empty for those that are no refusal."""

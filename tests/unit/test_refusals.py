@@ -80,7 +80,7 @@ def test_a_storm_is_told_ever_more_rarely_whatever_its_seconds(refusals: Refusal
         for second in range(100)
     ]
     assert len([text for text in told if text]) == 7
-    assert told[63].endswith("(the 64th time)")
+    assert told[63].endswith("(time 64)")
 
 
 def test_made_up_keys_do_not_fill_the_memory(refusals: Refusals) -> None:
