@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import logging
+from collections import Counter
 from collections.abc import Callable
 
 from ground_station.command_log import CommandLog
@@ -11,6 +13,11 @@ from protocol import topics
 from protocol.bus import Bus
 from protocol.messages import CommandReply, DroneOrder, DroneState, Phase
 from protocol.mission import Mission
+
+log = logging.getLogger(__name__)
+
+REFUSALS_KEPT = 1000
+"""Refused commands whose ids are remembered: an id that was refused once must not come to mean something later."""
 
 
 class CommandService:
@@ -27,6 +34,9 @@ class CommandService:
         self._log, self._phase, self._changed = log, phase, changed
         self._desk = CommandDesk([drone.id for drone in mission.drones])
         self._one_at_a_time = asyncio.Lock()
+        self._refusals: dict[str, str] = {}
+        self._said_again: Counter[str] = Counter()
+        """How often a command came after its asker had been told that it is done with."""
         for command in log.earlier:
             self._desk.take(command)
         bus.serve(topics.COMMAND, self._answer)
@@ -54,10 +64,13 @@ class CommandService:
         """Raises `MessageError` for what is no command."""
         identity, verb, drones = parse_command(parameters)
         async with self._one_at_a_time:
-            if self._desk.known(identity):
-                return self._desk.reply(identity)
+            if self._desk.known(identity) or identity in self._refusals:
+                return self._repeat(identity)
             command = self._desk.consider(identity, verb, drones, self._phase())
             if isinstance(command, str):
+                if len(self._refusals) >= REFUSALS_KEPT:
+                    del self._refusals[next(iter(self._refusals))]
+                self._refusals[identity] = command
                 return refusal(identity, command)
             written = await asyncio.to_thread(self._log.append, command)
             # A disk that refuses must not keep a drone in the air.
@@ -67,3 +80,17 @@ class CommandService:
                 reply = reply.model_copy(update={"text": f"{reply.text} (not on disk: forgotten if I die)"})
             self._changed(reply.text)
             return reply
+
+    def _repeat(self, identity: str) -> CommandReply:
+        """What has become of it; nothing is done again."""
+        if identity in self._refusals:
+            return refusal(identity, self._refusals[identity])
+        reply = self._desk.reply(identity)
+        if not reply.awaited:
+            again = self._said_again[identity]
+            self._said_again[identity] += 1
+            if again.bit_count() == 1:  # not the first time, which tells the asker
+                log.warning(
+                    "command %d (%s) came again, though all have heard it: not obeyed", reply.number, reply.text
+                )
+        return reply

@@ -102,6 +102,36 @@ async def test_the_same_id_is_the_same_command(ground: Ground, place: Place) -> 
     assert ground.said == ["pause: drone 1"]
 
 
+async def test_an_old_command_that_comes_again_changes_nothing_and_is_told_of(
+    ground: Ground, place: Place, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with connect(place.link, place.mission) as operator:
+
+        async def ask(question: str) -> CommandReply:
+            return await operator.ask(topics.COMMAND, question, timeout_s=PATIENCE_S)
+
+        await ask("id=a1;verb=pause")
+        await ask("id=b2;verb=resume")
+        orders, said = ground.service.orders, list(ground.said)
+        for _ in range(4):
+            assert (await ask("id=a1;verb=pause")).awaited == ()
+
+    assert (ground.service.orders, ground.said) == (orders, said)
+    assert "command 1 (pause: drone 1, drone 3) came again, though all have heard it: not obeyed" in caplog.text
+
+
+async def test_an_id_that_was_refused_stays_refused(ground: Ground, place: Place) -> None:
+    async with connect(place.link, place.mission) as operator:
+        for question, accepted in (
+            ("id=a1;verb=resume", False),
+            ("id=b2;verb=pause", True),
+            ("id=a1;verb=resume", False),
+            ("id=c3;verb=resume", True),
+        ):
+            assert (await operator.ask(topics.COMMAND, question, timeout_s=PATIENCE_S)).accepted is accepted
+    assert ground.said[0].startswith("pause")
+
+
 async def test_a_ground_station_that_is_started_again_knows_what_was_commanded(
     ground: Ground, mission: Mission, bus: Bus, place: Place, tmp_path: Path
 ) -> None:
