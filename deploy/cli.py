@@ -239,6 +239,36 @@ def schema() -> None:
     print(mission_schema(), end="")
 
 
+@mission_app.command(name="router-config")
+def router_config(mission: MissionPath, /) -> None:
+    """Print the configuration with which zenoh's own router does what `covrecon router` does, access control included.
+
+    It holds who is admitted now: print it again when certificates were issued or revoked, and start the router again.
+
+    ```
+    covrecon mission router-config fleet.toml > router.json5
+    zenohd -c router.json5
+    ```
+    """
+    import json
+    from datetime import UTC, datetime
+
+    from protocol.credentials import ROUTER, load_register
+    from protocol.links import link_of
+    from protocol.mission_file import load_mission
+    from protocol.router import access_rules
+    from protocol.session import configuration, require_safe
+
+    checked = load_mission(mission)
+    link = link_of(checked, ROUTER)
+    require_safe(link, checked.transport.uplinks)
+    access = None
+    if link.credentials is not None:
+        access = access_rules(checked, load_register(link.credentials.folder).admitted(datetime.now(UTC)))
+    told = configuration("router", link, checked.name, uplinks=checked.transport.uplinks, access=access)
+    print(json.dumps(told, indent=2))
+
+
 def _process(command: str, module: str, what: str) -> None:
     """Let ``covrecon COMMAND`` become ``python -m MODULE``, which has its own options and help."""
 
