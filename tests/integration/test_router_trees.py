@@ -6,17 +6,23 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from deploy.local import environment
+from faults.certificates import make_credentials
 from faults.ports import free_port
 from protocol import topics
 from protocol.bus import Bus, connect
-from protocol.messages import JumpHead
+from protocol.credentials import load_credentials
+from protocol.messages import Event, JumpHead
 from protocol.mission_file import load_mission
 from protocol.session import Link
+from protocol.topics import Topic
+from protocol.wire import Message
 
 pytestmark = pytest.mark.light
 
@@ -27,6 +33,7 @@ name = "sites"
 [transport]
 endpoint = "{endpoint}"
 uplinks = {uplinks}
+credentials = "pki"
 [[drones]]
 id = 1
 start = [0.0, 0.0, 2.0, 0.0, 1.5]
@@ -35,7 +42,14 @@ Start = Callable[..., "subprocess.Popen[bytes]"]
 
 
 @pytest.fixture
-def start(tmp_path: Path) -> Iterator[Start]:
+def pki(tmp_path: Path) -> Path:
+    make_credentials(tmp_path / "pki", drones=(1,))
+    return tmp_path / "pki"
+
+
+@pytest.fixture
+def start(tmp_path: Path, pki: Path) -> Iterator[Start]:
+    assert pki.is_dir()
     started: list[subprocess.Popen[bytes]] = []
 
     def start(endpoint: str, uplinks: Sequence[str] = ()) -> subprocess.Popen[bytes]:
@@ -53,31 +67,45 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
 
 def endpoints(count: int) -> list[str]:
-    return [f"tcp/127.0.0.1:{free_port()}" for _ in range(count)]
+    return [f"tls/127.0.0.1:{free_port()}" for _ in range(count)]
 
 
-async def hears(speaker: Bus, listener: Bus) -> bool:
+async def hears(speaker: Bus, listener: Bus, topic: Topic[Any], message: Message, drone: int | str = "") -> bool:
     """Whether what one says reaches the other before long."""
-    heard: list[int] = []
-    listener.on(topics.HEAD, lambda head: heard.append(head.done))
-    for number in range(round(PATIENCE_S / POLL_S)):
-        speaker.put(topics.HEAD, JumpHead(epoch=1, next_sequence=0, done=number, phase="flying"))
+    heard: list[Message] = []
+    listener.on(topic, heard.append, drone or "")
+    for _ in range(round(PATIENCE_S / POLL_S)):
+        speaker.put(topic, message, drone)
         if await listener.until(lambda: bool(heard), POLL_S):
             return True
     return False
 
 
-async def test_when_one_of_two_routers_dies_its_clients_meet_at_the_other(start: Start) -> None:
+async def drone_hears(ground: Bus, drone: Bus) -> bool:
+    return await hears(ground, drone, topics.HEAD, JumpHead(epoch=1, next_sequence=0, done=0, phase="flying"))
+
+
+async def ground_hears(drone: Bus, ground: Bus) -> bool:
+    event = Event(source="drone/1", tick=1, level="info", kind="mode", text="here")
+    return await hears(drone, ground, topics.EVENT, event, 1)
+
+
+def link(pki: Path, identity: str, *endpoints: str) -> Link:
+    credentials = load_credentials(pki, identity, now=datetime.now(UTC))
+    return Link(endpoints[0], endpoints[1:], credentials)
+
+
+async def test_when_one_of_two_routers_dies_its_clients_meet_at_the_other(start: Start, pki: Path) -> None:
     first, second = endpoints(2)
     doomed = start(first)
     start(second, [first])
     async with (
-        connect(Link(first, (second,)), "sites") as drone,
-        connect(Link(second, (first,)), "sites") as ground,
+        connect(link(pki, "drone-1", first, second), "sites") as drone,
+        connect(link(pki, "ground", second, first), "sites") as ground,
     ):
         ground.watch_lives()
         drone.announce("drone/1")
-        assert await hears(ground, drone), "they are at different routers"
+        assert await drone_hears(ground, drone), "they are at different routers"
         assert await ground.until(lambda: "drone/1" in ground.alive, PATIENCE_S)
 
         doomed.kill()
@@ -85,29 +113,35 @@ async def test_when_one_of_two_routers_dies_its_clients_meet_at_the_other(start:
         assert await ground.until(lambda: "drone/1" not in ground.alive, PATIENCE_S)
 
         assert await ground.until(lambda: "drone/1" in ground.alive, PATIENCE_S)
-        assert await hears(ground, drone)
-        assert await hears(drone, ground)
+        assert await drone_hears(ground, drone)
+        assert await ground_hears(drone, ground)
 
 
-async def test_sites_hear_each_other_through_the_router_above_them(start: Start) -> None:
+async def test_sites_hear_each_other_through_the_router_above_them(start: Start, pki: Path) -> None:
     above, *sites = endpoints(3)
     for site in sites:  # which wait for the one above, however late it comes
         start(site, [above])
     start(above)
-    here, there = (Link(site) for site in sites)
-    async with connect(here, "sites") as drone, connect(there, "sites") as ground:
-        assert await hears(ground, drone)
-        assert await hears(drone, ground)
+    async with (
+        connect(link(pki, "drone-1", sites[0]), "sites") as drone,
+        connect(link(pki, "ground", sites[1]), "sites") as ground,
+    ):
+        assert await drone_hears(ground, drone)
+        assert await ground_hears(drone, ground)
 
 
-async def test_a_site_goes_on_alone_while_the_router_above_it_is_away(start: Start) -> None:
+async def test_a_site_goes_on_alone_while_the_router_above_it_is_away(start: Start, pki: Path) -> None:
     above, site = endpoints(2)
     upper = start(above)
     start(site, [above])
-    async with connect(site, "sites") as drone, connect(site, "sites") as mate, connect(above, "sites") as ground:
-        assert await hears(ground, drone)
+    async with (
+        connect(link(pki, "drone-1", site), "sites") as drone,
+        connect(link(pki, "operator-anna", site), "sites") as mate,
+        connect(link(pki, "ground", above), "sites") as ground,
+    ):
+        assert await drone_hears(ground, drone)
         upper.kill()
         upper.wait()
-        assert await hears(mate, drone)
+        assert await ground_hears(drone, mate)
         start(above)
-        assert await hears(ground, drone), "and finds back to it"
+        assert await drone_hears(ground, drone), "and finds back to it"
