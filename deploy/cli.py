@@ -17,6 +17,7 @@ from cyclopts.validators import Number
 from deploy.completion_command import completion_of
 from deploy.doctor_command import doctor
 from deploy.export_command import export_app
+from deploy.pki_command import pki_app
 from deploy.recording_command import recording_app
 from deploy.replay_command import replay
 from protocol.errors import CovreconError, CredentialsError, MissionError, SceneError
@@ -40,6 +41,7 @@ mission_app = App(name="mission", help="Check and show mission files. Example: c
 app.command(mission_app)
 app.command(recording_app)
 app.command(export_app)
+app.command(pki_app)
 app.command(replay)
 app.command(doctor)
 app.command(completion_of(app), name="completion")

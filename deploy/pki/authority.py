@@ -7,6 +7,7 @@ router, and could not be revoked; one that was registered and never written harm
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from datetime import datetime, timedelta
 from pathlib import Path
 
@@ -45,6 +46,8 @@ def init(folder: Path, hosts: Iterable[str], *, now: datetime, life: timedelta =
     Raises:
         CredentialsError: there is one already, or the folder cannot be written.
     """
+    authority = make_authority(now)
+    made = _make(authority, Register(), GROUND_COMPUTER, (*hosts, *OWN_HOSTS), now, life)
     make_folder(folder)
     with locked(folder):
         for name in (AUTHORITY_KEY_FILE, AUTHORITY_FILE, REGISTER_FILE):
@@ -53,8 +56,6 @@ def init(folder: Path, hosts: Iterable[str], *, now: datetime, life: timedelta =
                     f"{folder / name} is there already, and certificates of a new authority would not fit those of"
                     " the old; choose another folder"
                 )
-        authority = make_authority(now)
-        made = _make(authority, Register(), GROUND_COMPUTER, (*hosts, *OWN_HOSTS), now, life)
         write(folder / AUTHORITY_KEY_FILE, authority.key_pem(), PRIVATE)
         write(folder / AUTHORITY_FILE, authority.certificate_pem(), PUBLIC)
         return _hand_out(folder, Register(), made)
@@ -128,11 +129,10 @@ def revoke(folder: Path, names: Sequence[str], *, now: datetime) -> tuple[Entry,
     """
     with locked(_existing(folder)):
         register = load_register(folder)
-        known = {entry.common_name for entry in register.certificates}
-        known |= {entry.identity for entry in register.certificates}
-        unknown = [name for name in names if name not in known]
+        identities = _of(register.certificates)
+        unknown = set(names) - set(identities) - {entry.common_name for entry in register.certificates}
         if unknown:
-            raise CredentialsError(f"never issued: {', '.join(unknown)}; there are {', '.join(sorted(known))}")
+            raise CredentialsError(f"never issued: {', '.join(sorted(unknown))}; there are {', '.join(identities)}")
         meant = {entry.common_name for entry in register.certificates if {entry.common_name, entry.identity} & {*names}}
         entries = tuple(
             entry.model_copy(update={"revoked": now.replace(microsecond=0)})
@@ -243,6 +243,7 @@ def _write_register(folder: Path, register: Register) -> None:
 
 
 def _delete_revoked(path: Path, revoked: Iterable[str]) -> None:
-    if path.exists() and common_name_of(load_certificate(path, "")) in revoked:
-        path.with_suffix(".key").unlink(missing_ok=True)
-        path.unlink()
+    with suppress(CredentialsError):  # not there, or damaged: of no use to anybody
+        if common_name_of(load_certificate(path, "")) in revoked:
+            path.with_suffix(".key").unlink(missing_ok=True)
+            path.unlink()

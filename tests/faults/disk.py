@@ -81,11 +81,16 @@ def dies(action: Callable[[], object], step: int) -> bool:
 
         return wrapped
 
+    original = Path.open
+
+    def mortal_open(path: Path, mode: str = "r", *options: Any, **named: Any) -> Any:
+        return original(path, mode, *options, **named) if "r" in mode else _Whole(Mortal(path, mode.strip("b")))
+
     def run() -> None:
         for name in _CALLS:
             setattr(os, name, counted(getattr(os, name)))
         record_file.FileIO = Mortal  # type: ignore[misc]
-        Path.open = lambda path, mode: _Whole(Mortal(path, mode.strip("b")))  # type: ignore[method-assign,assignment,misc]
+        Path.open = mortal_open  # type: ignore[method-assign,assignment]
         action()
 
     code = in_child(run)
