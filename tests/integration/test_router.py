@@ -86,6 +86,16 @@ def test_a_router_that_cannot_listen_is_bad_input_and_names_the_endpoint(start: 
     assert said in output.splitlines()[-1]
 
 
+def test_a_router_that_strangers_could_reach_does_not_start(start: Start) -> None:
+    port = free_port()
+    router = start(f"tcp/0.0.0.0:{port}")
+    _, output = router.communicate(timeout=PATIENCE_S)
+
+    assert router.returncode == 2
+    assert f"tcp/0.0.0.0:{port}: would be open to other computers" in output.splitlines()[-1]
+    assert f"write tls/0.0.0.0:{port} and set transport.credentials" in output
+
+
 async def test_clients_find_each_other_again_after_the_router_was_killed(start: Start) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     router = start(endpoint)
