@@ -31,7 +31,8 @@ def doctor(
 ) -> int:
     """Say whether this computer can fly a mission, and what to do where it cannot. Nothing is changed.
 
-    Looks at libraries, ports, clock, disk, memory, processor, GPU, and who could reach the processes from elsewhere.
+    Looks at libraries, ports, certificates, clock, disk, memory, processor, GPU, and who could reach the processes from
+    elsewhere.
     "warn" flies, but worse or less safely. Exit code 1 if anything fails.
 
     ```

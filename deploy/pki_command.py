@@ -41,7 +41,7 @@ Hosts = Annotated[
 
 
 @pki_app.command
-def init(folder: Folder = FOLDER, /, *, host: Hosts, days: Days = 90) -> None:
+def init(folder: Folder = FOLDER, *, host: Hosts, days: Days = 90) -> None:
     """Make an authority, and the certificates of router, ground station and simulator.
 
     ```
@@ -147,24 +147,26 @@ def revoke(*names: Name, folder: Folder = FOLDER) -> None:
     revoked = make(folder, _named(names), now=now)
     for entry in revoked:
         print(f"{entry.common_name}: revoked at {entry.revoked:%Y-%m-%d %H:%M} UTC")
+    left = {entry.identity: admitted_issues(folder, entry.identity, now) for entry in revoked}
+    if left.get(ROUTER) == ():
+        print("A router whose own certificate is revoked reads no register. Give it another before all else:")
+        print(f"  covrecon pki issue {ROUTER} --host ADDRESS{_option(folder)}")
     print("The router admits them until it has the new register. Copy it now, and have it read:")
     print(f"  {_copy(folder, ['register.json'], GROUND_PLACE)}")
     print(f"  {RELOAD}")
-    for identity in dict.fromkeys(entry.identity for entry in revoked):
-        left = [entry.common_name for entry in admitted_issues(folder, identity, now)]
-        if left:
-            print(f"Still valid: {', '.join(left)}")
-        else:
+    for identity, others in left.items():
+        if others:
+            print(f"Still valid: {', '.join(entry.common_name for entry in others)}")
+        elif identity != ROUTER:
             print(f"A new one for {identity}: covrecon pki issue {identity}{_option(folder)}")
-        if identity == ROUTER:
-            print("Nobody tells drones that a router is revoked: whoever has its key can pose as the router until it")
-            print("expires. If it was stolen, make a new authority: covrecon pki init NEW-FOLDER --host ADDRESS")
+    if ROUTER in left:
+        print("Nobody tells drones that a router is revoked: whoever has its key can pose as the router until it")
+        print("expires. If it was stolen, make a new authority: covrecon pki init NEW-FOLDER --host ADDRESS")
 
 
 @pki_app.command
 def show(
     folder: Annotated[Path, Parameter(help="The authority's, or that of any computer of the fleet.")] = FOLDER,
-    /,
     *,
     as_json: Annotated[bool, Parameter(name="--json", negative="", show_default=False)] = False,
 ) -> int:

@@ -24,7 +24,7 @@ def read_file(path: Path, remedy: str) -> bytes:
     except FileNotFoundError as error:
         raise CredentialsError(f"{path}: no such file; {remedy}") from error
     except OSError as error:
-        raise CredentialsError(f"{path}: cannot be read: {error.strerror}") from error
+        raise CredentialsError(f"{path}: cannot be read: {error.strerror}; whose is it? See: ls -l {path}") from error
 
 
 def load_certificate(path: Path, remedy: str) -> x509.Certificate:

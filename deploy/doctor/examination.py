@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
+from deploy.doctor.certificates import check_certificates
 from deploy.doctor.clock import ClockState, check_clock, read_clock
 from deploy.doctor.finding import Finding
 from deploy.doctor.gpu import check_gpu
@@ -27,6 +29,7 @@ def examine(mission: Mission, out: Path) -> Iterator[Finding]:
     """
     yield Finding("python", "ok", f"{platform.python_version()} on {platform.platform(terse=True)}")
     yield from check_network(mission)
+    yield from check_certificates(mission.transport, datetime.now(UTC))
     yield from check_inputs(mission)
     yield check_socket_folder()
     for place in places(mission):

@@ -13,6 +13,7 @@ from typing import Literal
 
 from deploy.doctor.finding import Finding
 from deploy.run_folder import socket_folder_parent
+from protocol.endpoints import internet_endpoint
 from protocol.errors import ProcessError
 from protocol.metrics_endpoint import HOST, metrics_port
 from protocol.mission import Mission
@@ -63,12 +64,6 @@ def _vehicle_places(mission: Mission) -> Iterator[Place]:
             transport: Transport = "tcp" if found[1] == "tcpin" else "udp"
             host = found[2] or "0.0.0.0"  # noqa: S104  # what MAVSDK takes an empty host for
             yield Place(f"PX4 of drone {drone.id}", transport, host, int(found[3]), "vehicles.url")
-
-
-def internet_endpoint(endpoint: str) -> tuple[str, str, int] | None:
-    """Protocol, host and port of a zenoh endpoint like ``tcp/127.0.0.1:7447``; None of any other."""
-    found = re.fullmatch(r"(\w+)/\[?([^\]]*?)\]?:(\d+)(?:[?#].*)?", endpoint)
-    return (found[1], found[2], int(found[3])) if found else None
 
 
 def check_socket_folder() -> Finding:

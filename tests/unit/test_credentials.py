@@ -137,7 +137,10 @@ def test_a_file_that_cannot_be_read_is_told(drone: Path) -> None:
     (drone / "drone-3.key").unlink()
     (drone / "drone-3.key").mkdir()
 
-    assert refusal(drone) == f"{drone}/drone-3.key: cannot be read: Is a directory"
+    assert (
+        refusal(drone)
+        == f"{drone}/drone-3.key: cannot be read: Is a directory; whose is it? See: ls -l {drone}/drone-3.key"
+    )
 
 
 @pytest.mark.parametrize(

@@ -9,12 +9,14 @@ import signal
 import socket
 import time
 from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 from cyclopts import App
 
 from deploy.doctor import examination, libraries, machine
+from deploy.doctor.certificates import check_certificates
 from deploy.doctor.clock import ClockState, check_clock, read_clock
 from deploy.doctor.finding import Finding
 from deploy.doctor.gpu import LIST_GPUS, check_gpu
@@ -23,6 +25,7 @@ from deploy.doctor.libraries import check_libraries, load, remedy, required_libr
 from deploy.doctor.network import check_network
 from deploy.doctor.ports import Place, check_place, places
 from deploy.doctor_command import doctor
+from deploy.pki.authority import init, renew
 from protocol.mission import Drone, Mission, Reconstruction, Transport
 from protocol.operation_settings import Console, Metrics, Recording
 from protocol.vehicle_settings import Vehicles
@@ -254,29 +257,149 @@ def test_a_place_that_cannot_be_is_told_with_the_key_to_change(host: str, port: 
 
 
 @pytest.mark.parametrize(
-    ("endpoint", "host", "transport", "console", "certificates"),
+    ("endpoint", "host", "transport", "console"),
     [
-        ("", "127.0.0.1", "ok", "ok", "ok"),
-        ("tcp/127.0.0.1:7447", "::1", "ok", "ok", "ok"),
-        ("tcp/localhost:7447", "localhost", "ok", "ok", "ok"),
-        ("tcp/0.0.0.0:7447", "0.0.0.0", "warn", "warn", "ok"),  # noqa: S104
-        ("tcp/ground.example:7447", "192.168.1.5", "warn", "warn", "ok"),
-        ("tls/127.0.0.1:7447", "127.0.0.1", "ok", "ok", "fail"),
-        ("unixsock-stream//run/user/1000/z.sock", "127.0.0.1", "ok", "ok", "ok"),
-        ("tpc/127.0.0.1:7447", "127.0.0.1", "fail", "ok", "ok"),
-        ("127.0.0.1:7447", "127.0.0.1", "fail", "ok", "ok"),
+        ("", "127.0.0.1", "ok", "ok"),
+        ("tcp/127.0.0.1:7447", "::1", "ok", "ok"),
+        ("tcp/localhost:7447", "localhost", "ok", "ok"),
+        ("tcp/0.0.0.0:7447", "0.0.0.0", "fail", "warn"),  # noqa: S104
+        ("tcp/ground.example:7447", "192.168.1.5", "fail", "warn"),
+        ("ws/10.0.0.1:7447", "127.0.0.1", "fail", "ok"),
+        ("quic/127.0.0.1:7447", "127.0.0.1", "fail", "ok"),
+        ("tls/10.0.0.1:7447", "127.0.0.1", "ok", "ok"),
+        ("tls/127.0.0.1:7447", "127.0.0.1", "ok", "ok"),
+        ("unixsock-stream//run/user/1000/z.sock", "127.0.0.1", "ok", "ok"),
+        ("tpc/127.0.0.1:7447", "127.0.0.1", "fail", "ok"),
+        ("127.0.0.1:7447", "127.0.0.1", "fail", "ok"),
     ],
 )
-def test_who_can_be_reached_from_elsewhere_is_warned_of(
-    endpoint: str, host: str, transport: str, console: str, certificates: str
-) -> None:
+def test_who_can_be_reached_from_elsewhere_is_told(endpoint: str, host: str, transport: str, console: str) -> None:
     mission = MISSION.model_copy(update={"transport": Transport(endpoint=endpoint), "console": Console(host=host)})
+    found = list(check_network(mission))
 
-    assert levels(check_network(mission)) == {
-        "transport": transport,
-        "console": console,
-        "certificates": certificates,
+    assert levels(iter(found)) == {"transport": transport, "console": console}
+    assert all(finding.advice for finding in found if finding.level != "ok")
+
+
+def test_an_endpoint_without_encryption_is_refused_with_what_to_write_instead() -> None:
+    mission = MISSION.model_copy(update={"transport": Transport(endpoint="tcp/10.0.0.1:7447")})
+
+    finding = next(check_network(mission))
+    assert finding.text.startswith("refused: tcp/10.0.0.1:7447 would be open to other computers, without encryption")
+    assert finding.advice.startswith("transport.endpoint: write tls/10.0.0.1:7447 and set transport.credentials")
+
+
+def test_other_routers_are_judged_by_the_same_measure() -> None:
+    transport = Transport(alternatives=("tls/10.0.0.2:7447", "tcp/10.0.0.3:7447"), uplinks=("tcp/10.1.0.1:7447",))
+    found = levels(check_network(MISSION.model_copy(update={"transport": transport})))
+
+    assert found == {
+        "transport": "ok",
+        "alternative 1": "ok",
+        "alternative 2": "fail",
+        "uplink 1": "fail",
+        "console": "ok",
     }
+
+
+# --- certificates --------------------------------------------------------------------------------------------------
+
+MADE = datetime(2026, 8, 1, 12, tzinfo=UTC)
+TLS = "tls/10.0.0.1:7447"
+
+
+@pytest.fixture
+def pki(tmp_path: Path) -> Path:
+    init(tmp_path / "pki", ["10.0.0.1"], now=MADE)
+    return tmp_path / "pki"
+
+
+def certificates(folder: Path, endpoint: str = TLS, now: datetime = MADE) -> dict[str, Finding]:
+    transport = Transport(endpoint=endpoint, credentials=str(folder))
+    return {finding.subject: finding for finding in check_certificates(transport, now)}
+
+
+@pytest.mark.parametrize("endpoint", ["", "tcp/127.0.0.1:7447"])
+def test_certificates_are_not_asked_for_where_none_are_shown(endpoint: str, tmp_path: Path) -> None:
+    assert levels(check_certificates(Transport(endpoint=endpoint), MADE)) == {"certificates": "ok"}
+    assert [found.level for found in certificates(tmp_path / "none", endpoint).values()] == ["ok"]
+
+
+@pytest.mark.parametrize(
+    "transport", [Transport(endpoint=TLS), Transport(endpoint="tls/127.0.0.1:7447"), Transport(alternatives=(TLS,))]
+)
+def test_an_endpoint_that_wants_certificates_fails_without_them(transport: Transport) -> None:
+    (finding,) = check_certificates(transport, MADE)
+
+    assert finding.level == "fail"
+    assert "covrecon pki init" in finding.advice
+
+
+def test_each_certificate_of_this_computer_is_told_with_its_days(pki: Path) -> None:
+    renew(pki, ["sim"], now=MADE, life=timedelta(days=13))
+    found = certificates(pki)
+
+    assert {subject: (finding.level, finding.text) for subject, finding in found.items()} == {
+        "certificate ground": ("ok", "ground.1, 90 days left"),
+        "certificate router": ("ok", "router.1, 90 days left"),
+        "certificate sim": ("warn", "sim.2, 13 days left"),
+        "register": ("ok", "certificates that the router admits: 4"),
+    }
+    assert found["certificate sim"].advice == "covrecon pki renew sim"
+
+
+def test_an_expired_or_unsafe_certificate_fails_with_what_mends_it(pki: Path) -> None:
+    (pki / "ground.key").chmod(0o644)
+    found = certificates(pki)
+    assert (found["certificate ground"].level, found["certificate ground"].advice) == (
+        "fail",
+        f"run: chmod 600 {pki}/ground.key",
+    )
+    assert found["certificate sim"].level == "ok"
+
+    late = certificates(pki, now=MADE + timedelta(days=90))
+    assert late["certificate router"].text.startswith(f"{pki}/router.pem: expired at 2026-10-30 12:00 UTC")
+    assert "covrecon pki renew router" in late["certificate router"].advice
+
+
+def test_a_router_needs_its_register_and_a_drone_does_not(pki: Path) -> None:
+    (pki / "register.json").unlink()
+    found = certificates(pki)
+    assert (found["register"].level, found["certificate router"].level) == ("fail", "ok")
+
+    (pki / "router.pem").unlink()
+    assert set(certificates(pki)) == {"certificate ground", "certificate sim"}
+
+
+def test_a_folder_without_certificates_fails(tmp_path: Path) -> None:
+    assert certificates(tmp_path / "none")["certificates"].level == "fail"
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "known"),
+    [
+        ("tls/10.0.0.1:7447", True),
+        ("tls/[0:0::1]:7447", True),
+        ("tls/LOCALHOST:7447", True),
+        ("tls/0.0.0.0:7447", True),
+        ("tls/10.0.0.9:7447", False),
+        ("tls/ground.example:7447", False),
+    ],
+)
+def test_a_router_must_go_by_the_name_by_which_it_is_called(pki: Path, endpoint: str, *, known: bool) -> None:
+    found = certificates(pki, endpoint)
+
+    assert ("router's names" not in found) is known
+    if not known:
+        host = endpoint.removeprefix("tls/").removesuffix(":7447")
+        assert found["router's names"].level == "fail"
+        assert found["router's names"].advice == f"covrecon pki renew router --host {host}"
+
+
+def test_one_of_several_routers_goes_by_its_own_name(pki: Path) -> None:
+    transport = Transport(endpoint="tls/10.0.0.9:7447", alternatives=(TLS,), credentials=str(pki))
+
+    assert "router's names" not in {finding.subject for finding in check_certificates(transport, MADE)}
 
 
 # --- files and devices ---------------------------------------------------------------------------------------------
