@@ -407,6 +407,14 @@ def test_all_that_was_issued_is_listed_with_how_it_fares(fleet: Path) -> None:
     assert take_inventory(fleet, NOW + DAY).is_sound
 
 
+def test_a_certificate_whose_successor_was_revoked_is_in_use_again(fleet: Path) -> None:
+    renew(fleet, ["drone-1"], now=NOW)
+    revoke(fleet, ["drone-1.2"], now=NOW)
+
+    found = states(take_inventory(fleet, NOW + LIFE))
+    assert (found["drone-1.1"], found["drone-1.2"]) == ("expired", "revoked")
+
+
 def test_a_drones_folder_is_listed_without_a_register(made: Path, tmp_path: Path) -> None:
     drone = tmp_path / "drone"
     drone.mkdir(mode=0o700)
