@@ -59,18 +59,21 @@ async def _guard(mission: Mission, link: Link, credentials: Credentials) -> None
 
 
 async def _next(credentials: Credentials, changed: asyncio.Event) -> tuple[Credentials, Sequence[str]]:
-    """Certificate and register once they have changed and can be gone on with."""
+    """Certificate and register once there is a register that can be gone on with."""
     while True:
         await changed.wait()
         changed.clear()
         try:
-            fresh = load_credentials(credentials.folder, credentials.identity, now=datetime.now(UTC))
-            admitted = _admitted(fresh)
+            admitted = _admitted(credentials)
         except CredentialsError as error:
-            log.error("goes on with the certificates it has: %s", error)  # noqa: TRY400  # the message says all
+            log.error("goes on with the register it has: %s", error)  # noqa: TRY400  # the message says all
             continue
+        try:
+            credentials = load_credentials(credentials.folder, credentials.identity, now=datetime.now(UTC))
+        except CredentialsError as error:  # whom it admits must not wait for that
+            log.error("goes on with the certificate it has: %s", error)  # noqa: TRY400  # likewise
         log.warning("certificates read again; all links are closed, and open again within a second or two")
-        return fresh, admitted
+        return credentials, admitted
 
 
 def _admitted(credentials: Credentials) -> Sequence[str]:

@@ -192,7 +192,7 @@ async def test_a_new_certificate_is_used_after_a_reload_and_a_damaged_register_c
         whole = register.read_bytes()
         register.write_bytes(whole[:50])
         fleet.router.send_signal(signal.SIGHUP)
-        fleet.wait_for_log("goes on with the certificates it has")
+        fleet.wait_for_log("goes on with the register it has")
         heard: list[int] = []
         async with connect(mine, "fleet") as drone:
             drone.on(topics.HEAD, lambda head: heard.append(head.done))
