@@ -20,6 +20,7 @@ from protocol.links import link_of
 from protocol.logs import configure, say_last
 from protocol.mission import Mission
 from protocol.mission_file import load_mission
+from protocol.service import told
 from protocol.session import Link
 
 DONE, FAILED, BAD_INPUT, TERMINATED = 0, 1, 2, 143
@@ -97,13 +98,14 @@ def run_process(role: str, body: Callable[[Arguments], Coroutine[None, None, Non
 
 
 async def _until_signal(body: Coroutine[None, None, None]) -> int:
-    task = asyncio.ensure_future(body)
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, task.cancel)
-    try:
-        await task
-    except asyncio.CancelledError:
-        log.info("ended by a signal")
-        return TERMINATED
-    return DONE
+    async with told():
+        task = asyncio.ensure_future(body)
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(number, task.cancel)
+        try:
+            await task
+        except asyncio.CancelledError:
+            log.info("ended by a signal")
+            return TERMINATED
+        return DONE
