@@ -15,6 +15,7 @@ import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from deploy.cli import app
 from faults.sandbox import settings_of
 from protocol.guard import PACKAGES, ROOT
 from protocol.mission_file import load_mission
@@ -300,6 +301,14 @@ def test_the_router_reads_its_certificates_again_on_reload() -> None:
     assert int(settings(unit_of("router"))["LimitNOFILE"]) >= 16384
 
 
+@pytest.mark.skipif(shutil.which("systemd-sysusers") is None, reason="systemd-sysusers is not installed")
+def test_systemd_makes_the_units_user(tmp_path: Path) -> None:
+    code, said = run("systemd-sysusers", f"--root={tmp_path}", DEPLOY / "systemd" / "covrecon.sysusers")
+
+    assert code == 0, said
+    assert (tmp_path / "etc" / "passwd").read_text().startswith("covrecon:x:")
+
+
 def test_all_units_filter_the_same_calls() -> None:
     """`tests/integration/test_confined.py` flies under one of them."""
     for name in ("SystemCallFilter", "RestrictAddressFamilies", "SystemCallErrorNumber"):
@@ -341,3 +350,26 @@ def test_a_drone_installs_neither_open3d_nor_torch() -> None:
 def test_the_extras_would_bring_them() -> None:
     assert closure("ground") & set(MAP)
     assert LEARNED in closure("learned")
+
+
+# --- the guide --------------------------------------------------------------------------------------------------------
+
+
+def test_the_guides_commands_are_those_of_the_command_line() -> None:
+    known = {name for name in app if not name.startswith("-")}
+    pages = [ROOT / "docs" / "fleet.md", COMPOSE, FLEET, *UNITS]
+    used = {
+        found for page in pages for found in re.findall(r"(?:bin/|[`# ])covrecon ([a-z][a-z0-9-]*)", page.read_text())
+    }
+
+    assert used >= {"pki", "command", "doctor", "mission"}
+    assert used <= known
+
+
+def test_the_guide_names_units_and_files_that_there_are() -> None:
+    guide = (ROOT / "docs" / "fleet.md").read_text()
+
+    assert set(re.findall(r"covrecon-(?:router|\w+(?=@))", guide)) == {unit.stem.rstrip("@") for unit in UNITS}
+    files = re.findall(r"\b(?:deploy|missions|tests)/[\w/.-]+\w", guide)
+    assert files
+    assert not [file for file in files if not (ROOT / file).exists()]
