@@ -303,6 +303,7 @@ def test_the_router_reads_its_certificates_again_on_reload() -> None:
 
 @pytest.mark.skipif(shutil.which("systemd-sysusers") is None, reason="systemd-sysusers is not installed")
 def test_systemd_makes_the_units_user(tmp_path: Path) -> None:
+    (tmp_path / "etc").mkdir()
     code, said = run("systemd-sysusers", f"--root={tmp_path}", DEPLOY / "systemd" / "covrecon.sysusers")
 
     assert code == 0, said
