@@ -23,6 +23,7 @@ from typing import Any, Protocol, TypeVar
 
 import zenoh
 
+from protocol import service
 from protocol.errors import BusError, MessageError, NoReply, VersionError
 from protocol.session import Link, errors_of, open_client, open_router
 from protocol.topics import Topic, alive_key
@@ -421,6 +422,7 @@ async def connect(
     else:
         session = await open_client(link, mission, timeout_s=timeout_s)
     bus = Bus(session, lossless=lossless)
+    service.ready(f"{'listening at' if router else 'connected to'} {link.endpoint}")
     try:
         yield bus
     finally:

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from deploy.local import environment
+from deploy.run_folder import socket_endpoint
 from protocol import service
 from protocol.guard import ROOT
 from protocol.service import HEARTBEAT, PERIOD_S, SOCKET, WATCHDOG, Service
@@ -194,3 +195,24 @@ def test_a_process_tells_systemd_from_its_start_to_its_end(tmp_path: Path, liste
     finally:
         process.kill()
         process.wait()
+
+
+@pytest.mark.processes
+@pytest.mark.light
+def test_a_router_is_ready_once_it_listens_and_its_client_once_it_is_connected(
+    tmp_path: Path, listener: Listener
+) -> None:
+    mission, endpoint = tmp_path / "mission.toml", socket_endpoint(tmp_path)
+    mission.write_text('[simulation]\nscene = ""\n[[drones]]\nid = 1\nstart = [0, 1, 2, 0, 1.3]\n')
+    told = environment(os.environ) | variables(tmp_path)
+    processes = []
+    try:
+        for module, status in (("protocol.router", "listening at"), ("sim_bridge", "connected to")):
+            command = [sys.executable, "-P", "-m", module, "--mission", mission, "--endpoint", endpoint]
+            processes.append(subprocess.Popen([*command, "--run", tmp_path], env=told))
+            while (heard := listener.hear())["STATUS"] != f"{status} {endpoint}":
+                assert heard["READY"] == "1"
+    finally:
+        for process in processes:
+            process.terminate()
+            process.wait(PATIENCE_S)
