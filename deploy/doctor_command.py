@@ -26,19 +26,22 @@ def doctor(
     drones: Annotated[
         int | None, Parameter(help="Team size, as for covrecon run.", validator=Number(gte=1, lte=255))
     ] = None,
+    drone: Annotated[
+        int, Parameter(help="Judge this computer as that drone's own.", validator=Number(gte=0, lte=255))
+    ] = 0,
     out: Annotated[Path, Parameter(help="Where run folders would be made.")] = Path("runs"),
     as_json: Annotated[bool, Parameter(name="--json", negative="", show_default=False)] = False,
 ) -> int:
     """Say whether this computer can fly a mission, and what to do where it cannot. Nothing is changed.
 
     Looks at libraries, ports, certificates, clock, disk, memory, processor, GPU, and who could reach the processes from
-    elsewhere.
-    "warn" flies, but worse or less safely. Exit code 1 if anything fails.
+    elsewhere. "warn" flies, but worse or less safely. Exit code 1 if anything fails.
 
     ```
     covrecon doctor                                   # with the default settings
     covrecon doctor missions/px4.toml                 # with what this mission wants
     covrecon doctor missions/demo.toml --drones 8 --json
+    covrecon doctor fleet.toml --drone 3              # on the computer that drone 3 carries
     ```
 
     Parameters
@@ -49,7 +52,7 @@ def doctor(
     from deploy.doctor.examination import examine
 
     findings = []
-    for finding in examine(_mission(mission, drones), out):
+    for finding in examine(_mission(mission, drones), out, drone):
         findings.append(finding)
         if not as_json:
             _show(finding)

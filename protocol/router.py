@@ -36,18 +36,18 @@ async def route(arguments: Arguments) -> None:
         CredentialsError: the register cannot be read.
     """
     mission, link = arguments.mission, arguments.link
+    changed = asyncio.Event()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, changed.set)
     if link.credentials is not None:
         with refusals_told(namespace_of(mission.name)):
-            await _guard(mission, link, link.credentials)
+            await _guard(mission, link, link.credentials, changed)
     async with connect(link, mission.name, router=True, uplinks=mission.transport.uplinks):
         log.info("listening at %s", link.endpoint)
         await asyncio.Event().wait()
 
 
-async def _guard(mission: Mission, link: Link, credentials: Credentials) -> None:
+async def _guard(mission: Mission, link: Link, credentials: Credentials, changed: asyncio.Event) -> None:
     """Listen, and listen anew whenever the certificates have changed; until cancelled."""
-    changed = asyncio.Event()
-    asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, changed.set)
     admitted = _admitted(credentials)
     while True:
         access = access_rules(mission, admitted)

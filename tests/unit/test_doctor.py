@@ -501,7 +501,7 @@ def two_findings(monkeypatch: pytest.MonkeyPatch) -> list[Mission]:
     """Replaces the examination; the missions that it was asked about."""
     asked = []
 
-    def examine(mission: Mission, _out: Path) -> Iterator[Finding]:
+    def examine(mission: Mission, _out: Path, _drone: int) -> Iterator[Finding]:
         asked.append(mission)
         yield Finding("clock", "warn", "not synchronised [maybe]", "run: timedatectl")
         if mission.name != "mission":
