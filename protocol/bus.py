@@ -26,6 +26,7 @@ import zenoh
 from protocol import service
 from protocol.errors import BusError, MessageError, NoReply, VersionError
 from protocol.session import Link, errors_of, open_client, open_router
+from protocol.stuck_links import give_up_stuck_links
 from protocol.topics import Topic, alive_key
 from protocol.wire import Message, decode, encode
 
@@ -284,6 +285,11 @@ class Bus:
         with errors_of("links"):
             self._declared.append(self._session.info.declare_link_events_listener(change, history=True))
 
+    def give_up_stuck_links(self) -> None:
+        """Of those over TLS (`protocol.stuck_links`)."""
+        with errors_of("links"):
+            self._declared.append(give_up_stuck_links(self._session))
+
     # --- queries -------------------------------------------------------------------------------------------------
 
     def serve(self, topic: Topic[M], answer: Callable[[dict[str, str]], Awaitable[M]], drone: int | str = "") -> None:
@@ -423,6 +429,8 @@ async def connect(
         session = await open_client(link, mission, timeout_s=timeout_s)
     bus = Bus(session, lossless=lossless)
     service.ready(f"{'listening at' if router else 'connected to'} {link.endpoint}")
+    if link.credentials is not None:
+        bus.give_up_stuck_links()
     try:
         yield bus
     finally:
