@@ -6,6 +6,7 @@ import asyncio
 import json
 import math
 import signal
+from collections.abc import Collection
 from typing import Any, TypeAlias
 
 from faults.processes import END_S, Flight
@@ -42,14 +43,15 @@ async def judge(flight: Flight, figures: Figures, *, new_epoch: bool) -> list[st
     return violations
 
 
-async def compare_replicas(flight: Flight, figures: Figures) -> list[str]:
-    """Wait until all replicas are equal within tolerance; a violation if they never are."""
+async def compare_replicas(flight: Flight, figures: Figures, lost: Collection[int] = ()) -> list[str]:
+    """Wait until all replicas, but those of drones that are ``lost``, are equal within tolerance; a violation if they
+    never are."""
     clock = asyncio.get_running_loop().time
     deadline = clock() + EQUAL_S
     allowed = TOLERANCES * flight.mission.replication.tolerance
-    comparison = await flight.monitor.compare()
+    comparison = await flight.monitor.compare(lost)
     while (comparison is None or comparison.worst_rms > allowed) and clock() < deadline:
-        comparison = await flight.monitor.compare()
+        comparison = await flight.monitor.compare(lost)
     if comparison is None:
         return ["not all replicas could be asked for phi at the same tick, jump and epoch"]
     figures |= {"bit_equal": comparison.bit_equal, "worst_rms": float(f"{comparison.worst_rms:.3g}")}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -110,12 +111,14 @@ class Monitor:
         """Of those that were heard lately."""
         return {drone: state.replica for drone, state in self.states.items() if state.tick > self.tick - FRESH_TICKS}
 
-    def is_healed(self) -> bool:
-        """Everybody is there, knows all of phi and all jumps, and integrates with little delay."""
-        replicas = self.replicas()
+    def is_healed(self, lost: Collection[int] = ()) -> bool:
+        """Everybody but the drones that are ``lost`` is there, knows all of phi and all jumps, and integrates with
+        little delay."""
+        left = [drone for drone in self._drones if drone not in lost]
+        replicas = {drone: replica for drone, replica in self.replicas().items() if drone not in lost}
         return (
-            {"ground", "sim", *(f"drone/{drone}" for drone in self._drones)} <= self.alive
-            and len(replicas) == len(self._drones)
+            {"ground", "sim", *(f"drone/{drone}" for drone in left)} <= self.alive
+            and len(replicas) == len(left)
             and self.head.done > self.tick - FRESH_TICKS
             and all(
                 replica.missing == 0
@@ -126,10 +129,12 @@ class Monitor:
             )
         )
 
-    async def compare(self) -> Comparison | None:
-        """All replicas at one tick of the near future; None when one of them did not answer for it."""
+    async def compare(self, lost: Collection[int] = ()) -> Comparison | None:
+        """All replicas, but those of drones that are ``lost``, at one tick of the near future; None when one of them
+        did not answer for it."""
         tick = self.tick + AHEAD_TICKS
-        found = await asyncio.gather(*(self._replica(drone, tick) for drone in (GROUND, *self._drones)))
+        asked = [GROUND, *(drone for drone in self._drones if drone not in lost)]
+        found = await asyncio.gather(*(self._replica(drone, tick) for drone in asked))
         ground, *others = found
         if ground is None:
             return None

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 import trimesh
@@ -78,6 +78,11 @@ DURATION_S = 240.0
 PLACES = ((-0.9, -0.9, 0.0), (0.9, 0.9, 3.0), (-0.9, 0.9, 0.0), (0.9, -0.9, 3.0))
 """Where drones start: x, y, yaw."""
 
+Point: TypeAlias = tuple[float, float, float]
+Box: TypeAlias = tuple[Point, Point]
+"""Extents and centre, m."""
+TABLE: tuple[Box, ...] = (((3.0, 3.0, 0.1), (0, 0, -0.05)), ((0.8, 0.6, 0.35), (0.1, 0.0, 0.175)))
+
 Transport = Literal["tcp", "udp"]
 
 
@@ -98,12 +103,13 @@ def processes_of(folder: Path, module: str = "") -> list[int]:
     return found
 
 
-def write_scene(folder: Path) -> Path:
-    """A table on a floor, every face covered with random patches: as small as a world can be and still be mapped."""
+def write_scene(folder: Path, boxes: Sequence[Box] = TABLE) -> Path:
+    """Boxes, every face covered with random patches; a table on a floor is as small as a world can be and still be
+    mapped."""
     patches = np.random.default_rng(7).integers(0, 255, (20, 20, 3), dtype=np.uint8)
     image = Image.fromarray(patches).resize((512, 512), Image.Resampling.BICUBIC)
     parts = []
-    for extents, centre in (((3.0, 3.0, 0.1), (0, 0, -0.05)), ((0.8, 0.6, 0.35), (0.1, 0.0, 0.175))):
+    for extents, centre in boxes:
         box = trimesh.creation.box(extents)
         box.apply_translation(centre)
         box.unmerge_vertices()
@@ -142,7 +148,7 @@ def small_mission(
 
 
 @functools.cache
-def _compile_once(mission: Mission) -> None:
+def compile_once(mission: Mission) -> None:
     compile_everything(mission)
 
 
@@ -178,6 +184,10 @@ class Flight:
                 env=environment(os.environ) | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"},
                 process_group=self._group,
             )
+
+    @property
+    def running(self) -> list[str]:
+        return [name for name in self._running if self.code(name) is None]
 
     def pid(self, name: str) -> int:
         return self._running[name].pid
@@ -241,7 +251,7 @@ async def fly(
 
     ``linked``: who reaches the router by a link that can be made bad. ``late``: who is not started yet.
     """
-    await asyncio.to_thread(_compile_once, mission)
+    await asyncio.to_thread(compile_once, mission)
     port = free_port(socket.SOCK_STREAM if transport == "tcp" else socket.SOCK_DGRAM)
     endpoint = f"{transport}/127.0.0.1:{port}"
     run = make_run_folder(folder, mission, datetime.now(UTC), endpoint)
@@ -256,7 +266,7 @@ async def fly(
         private = Path(stack.enter_context(TemporaryDirectory(ignore_cleanup_errors=True)))
         group = await stack.enter_async_context(process_group(private, GRACE_S))
         ways = {name: made.endpoint for name, made in (links | datagram_links).items()}
-        commands = _commands(mission, run, endpoint, ways)
+        commands = commands_of(mission, run, endpoint, ways)
         flight = Flight(mission, run, endpoint, links, datagram_links, commands, group)
         try:
             flight.start("router")
@@ -271,7 +281,7 @@ async def fly(
             flight.end()
 
 
-def _commands(mission: Mission, run: Path, endpoint: str, ways: dict[str, str]) -> dict[str, tuple[str, ...]]:
+def commands_of(mission: Mission, run: Path, endpoint: str, ways: dict[str, str]) -> dict[str, tuple[str, ...]]:
     """Of each process, with its own way to the router, and the simulator with a witness where it carries vehicles."""
     drones, px4 = [drone.id for drone in mission.drones], mission.vehicles.kind == "px4"
     simulator = "sim_bridge" if px4 else "faults.witness"
