@@ -51,21 +51,30 @@ install_system_packages() {
 # pip's output cut down to the downloads that take time.
 large_downloads() { sed -un 's/^ *Downloading \([^ ]*\) (\([0-9.]* MB\)).*/install:   \1 \2/p'; }
 
-# A browser is wished for, not needed: what cannot be had is told.
+# What tests wish for and do not need: what cannot be had is told. $1: package, $2: tests that are left out without it.
+install_wished() {
+    local line="apt-get install -y --no-install-recommends $1"
+    if [[ $(id -u) == 0 ]] && command -v apt-get >/dev/null; then
+        echo "install: system packages: $1"
+        if apt-get update -qq && DEBIAN_FRONTEND=noninteractive $line -qq >/dev/null; then
+            return
+        fi
+    fi
+    echo "install: no $1: tests of $2 are left out; to run them:  sudo $line"
+}
+
 install_browser() {
-    local name line="apt-get install -y --no-install-recommends chromium"
+    local name
     for name in "${BROWSERS[@]}"; do
         if command -v "$name" >/dev/null; then
             return
         fi
     done
-    if [[ $(id -u) == 0 ]] && command -v apt-get >/dev/null; then
-        echo "install: system packages: chromium"
-        apt-get update -qq
-        DEBIAN_FRONTEND=noninteractive $line -qq >/dev/null && return
-    fi
-    echo "install: no browser: tests of the console are left out; to run them:  sudo $line"
+    install_wished chromium "the console"
 }
+
+# Network namespaces, in which one machine stands for many; for root alone.
+install_hosts() { PATH=$PATH:/sbin:/usr/sbin command -v ip >/dev/null || install_wished iproute2 "many hosts"; }
 
 # $1: python, then what to install.
 install_packages() {
@@ -99,6 +108,7 @@ has_venv "$python" || fail "$python has no venv module: install it, or name anot
 
 if [[ ${1:-} == tests ]]; then
     install_browser
+    install_hosts
     echo "install: test tools, about 1 GB more"
     install_packages "$python" --editable '.[ground,camera]' --group dev
 else
