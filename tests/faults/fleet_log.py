@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 import os
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -91,17 +91,20 @@ class FleetLog:
         """J as the state that came last before the end of ``tick`` has it."""
         return next(each.importance for each in reversed(self.heard) if each.tick <= tick)
 
-    @contextmanager
-    def phase(self, name: str) -> Iterator[None]:
-        begin = self._read()
+    @asynccontextmanager
+    async def phase(self, name: str) -> AsyncIterator[None]:
+        begin = await self._read()
         yield
-        self.phases.append(Phase(name, begin, self._read()))
+        self.phases.append(Phase(name, begin, await self._read()))
 
-    def _read(self) -> _Reading:
-        traffic = {name: (self.hosts.bytes_up(name), self.hosts.bytes_down(name)) for name in self.flight.drones}
+    async def _read(self) -> _Reading:
+        traffic = await asyncio.to_thread(self._count)  # it starts programs, and ticks are to be stamped meanwhile
         cpu_s = {"watcher": time.process_time()}
         cpu_s |= {name: _cpu_s(self.flight.pid(name)) for name in self.flight.running}
         return _Reading(self.flight.monitor.tick, self._now_s(), traffic, cpu_s)
+
+    def _count(self) -> dict[str, tuple[int, int]]:
+        return {name: (self.hosts.bytes_up(name), self.hosts.bytes_down(name)) for name in self.flight.drones}
 
     # --- figures -------------------------------------------------------------------------------------------------
 

@@ -49,18 +49,18 @@ J_END = 0.8
 async def scenario(hosts: Hosts, flight: Flight, log: FleetLog, figures: Figures) -> list[str]:
     """All well; a link cut and healed; a computer lost. Violations; ``figures`` gets what was measured."""
     others = [drone for drone in DRONES if drone != LOST]
-    with log.phase("all well"):
+    async with log.phase("all well"):
         await flight.flying(WELL_S)
-    with log.phase("link cut"):
+    async with log.phase("link cut"):
         hosts.cut(f"drone-{CUT}")
         await flight.flying(CUT_S)
         hosts.heal(f"drone-{CUT}")
-    with log.phase("healed"):
+    async with log.phase("healed"):
         figures["healed_in_s"] = round(await flight.until(flight.monitor.is_healed, "the drone to be back", HEAL_S), 2)
         took_s = await flight.until(lambda: all(map(log.flies, DRONES)), "all to fly on", HEAL_S)
         figures["all_fly_in_s"] = round(took_s, 2)
         violations = await compare_replicas(flight, figures)
-    with log.phase("computer lost"):
+    async with log.phase("computer lost"):
         hosts.cut(f"drone-{LOST}")
         flight.signal(f"drone-{LOST}", signal.SIGKILL)
         took_s = await flight.until(lambda: not _is_told_alive(flight, LOST), "the loss to be told", NOTICE_S)

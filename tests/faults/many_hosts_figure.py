@@ -13,11 +13,13 @@ from ground_station.separation import nearest_distances
 
 SIZE_IN = (9.0, 6.0)
 DPI = 120
-SHADES = {"link cut": "tab:orange", "computer lost": "tab:red"}
+FOR_GOOD = "computer lost"
+SHADES = {"link cut": "tab:orange", FOR_GOOD: "tab:red"}
+"""By part of the flight; one has no end."""
 
 
 def draw(log: FleetLog, flight: Flight, path: Path) -> None:
-    """All over mission time; shaded while something is wrong."""
+    """All over mission time, shaded while something is wrong."""
     tick_s, drones = flight.mission.tick_s, [drone.id for drone in flight.mission.drones]
     figure = Figure(SIZE_IN, layout="constrained")
     falling, apart, ages = figure.subplots(3, 1, sharex=True)
@@ -39,10 +41,9 @@ def draw(log: FleetLog, flight: Flight, path: Path) -> None:
     for axes in (falling, apart, ages):
         for phase in log.phases:
             if phase.name in SHADES:
+                end = positions[-1][0] if phase.name == FOR_GOOD else phase.end.tick
                 label = phase.name if axes is falling else None
-                axes.axvspan(
-                    phase.begin.tick * tick_s, phase.end.tick * tick_s, color=SHADES[phase.name], alpha=0.2, label=label
-                )
+                axes.axvspan(phase.begin.tick * tick_s, end * tick_s, color=SHADES[phase.name], alpha=0.2, label=label)
         axes.grid(alpha=0.3)
     falling.legend(loc="upper right", fontsize="small", ncols=3)
     apart.legend(loc="upper right", fontsize="small")
