@@ -23,6 +23,7 @@ from prometheus_client import CollectorRegistry
 from agents.agent_metrics import AgentMetrics
 from agents.cameras.choice import make_feed
 from agents.coverage import CoverageController, Decision
+from agents.hearing import Hearing
 from agents.homing import Homecoming
 from agents.orders import Orders
 from agents.policies import Order
@@ -98,6 +99,7 @@ class Agent:
         self._homecoming = Homecoming(mission, drone, self._planner)
         self._clock = clock_of(mission, bus, lockstep=lockstep, now_s=now_s)
         self._news = News(bus, topics.EVENT, f"drone/{drone}", drone)
+        self._hearing = Hearing(mission, drone, bus, self._replication, self._team, self._news.tell, lockstep=lockstep)
         self._vehicle = make_vehicle(mission, drone, bus, now_s=self._clock.now_s, events=self._note_event)
         self._orders = Orders(mission, self._clock.now_s, self._news.tell)
         self._operator = DroneOrder(drone=drone, action="fly", number=0)
@@ -111,7 +113,6 @@ class Agent:
         )
         self._earlier: deque[tuple[int, Vector5]] = deque(maxlen=PASSED_STATES)
         self._published = -1
-        self._tick = 0
         self._cells = float(self._replication.replica.field.field.size)
         self._cells_at = -np.inf
         self._control: Control | None = None
@@ -125,7 +126,6 @@ class Agent:
         """As its newest state says."""
         bus.on_foreign(partial(self._news.tell, "error", "link"))
         bus.on(topics.TICK, self._replication.hear_tick)
-        bus.on(topics.STATE, self._hear_state, wakes=lockstep)
         bus.on(topics.JUMP, self._replication.hear_jump)
         bus.on(topics.HEAD, self._hear_head)
         bus.on(topics.DIGEST, self._replication.hear_digest)
@@ -182,11 +182,6 @@ class Agent:
         known: dict[str, EventLevel] = {"warning": "warning", "error": "error", "critical": "error"}
         self._news.tell(known.get(level.lower(), "info"), "vehicle", text)
 
-    def _hear_state(self, state: DroneState) -> None:
-        if state.drone != self._drone:
-            self._replication.hear_state(state)
-            self._team.hear(state, self._tick)  # also one whose state phi cannot use is an obstacle
-
     def _hear_head(self, head: JumpHead) -> None:
         self._ground_heard_s = self._now_s()
         self._replication.hear_head(head)
@@ -204,10 +199,11 @@ class Agent:
     # --- one tick ------------------------------------------------------------------------------------------------
 
     async def _step(self, tick: Tick) -> None:
-        self._tick = self._news.tick = tick.tick
+        self._hearing.tick = self._news.tick = tick.tick
         if self._clock.backlog:  # it is over already: phi catches up with it later, and nothing is decided
             self._earlier.extend((tick.tick, own.pose) for own in tick.vehicles if own.drone == self._drone)
             return
+        self._hearing.look()
         telemetry, condition = self._vehicle.telemetry(), self._vehicle.condition()
         order = self._give_orders(telemetry, condition)
         if condition.authority == "ready" and not self._finished and order.action == "wait":

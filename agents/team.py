@@ -10,6 +10,7 @@ import numpy as np
 from agents.barriers import Neighbour, predicted_pose
 from protocol.messages import DroneState
 from protocol.mission import Flight
+from protocol.team_states import Sighting
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,16 +30,14 @@ class Team:
         self._own, self._flight, self._tick_s = own, flight, tick_s
         self._last_seen = {drone: _Seen(0, start, (0.0,) * 5) for drone, start in starts.items() if drone != own}
 
-    def hear(self, state: DroneState, now: int) -> None:
+    def hear(self, state: DroneState | Sighting, now: int) -> None:
         """``now``: this drone's own newest tick. An older state never replaces a newer one, and none is younger than
         its arrival, give or take the tick that its sender may have heard first: a clock that is ahead must not hide
         that its drone fell silent."""
         known = self._last_seen.get(state.drone)
         if state.drone != self._own and (known is None or known.tick <= state.tick):
             tick = min(state.tick, now + 1)
-            self._last_seen[state.drone] = _Seen(
-                tick, state.pose, state.velocity, state.blind_s, state.mode == "landed"
-            )
+            self._last_seen[state.drone] = _Seen(tick, state.pose, state.velocity, state.blind_s, state.landed)
 
     def neighbours(self, tick: int, delay_s: float = 0.0) -> list[Neighbour]:
         """All the others at ``tick``, ascending by id; the longer silent, the larger, and the longer ``delay_s``, the

@@ -50,7 +50,7 @@ class _Subscription:
     topic: Topic[Any]
     take: Callable[[], zenoh.Sample | None]
     """The oldest message that waits."""
-    handle: object
+    handle: zenoh.Subscriber[Any]
     """Kept because zenoh undeclares a subscriber that nobody refers to."""
     handlers: list[Callable[[Any], None]] = field(default_factory=list)
 
@@ -137,6 +137,12 @@ class Bus:
                 subscription = (self._declare_waking if wakes else self._declare_ring)(key, topic)
             self._subscriptions[key, wakes] = subscription
         subscription.handlers.append(handler)
+
+    def off(self, topic: Topic[Any], drone: int | str = "*", *, wakes: bool = True) -> None:
+        """Undo `on`, for all handlers; what has not been handled yet is dropped."""
+        key = topic.of(drone)
+        with errors_of(key):
+            self._subscriptions.pop((key, wakes)).handle.undeclare()  # type: ignore[no-untyped-call]  # as in _drop
 
     def _declare_waking(self, key: str, topic: Topic[Any]) -> _Subscription:
         queue: deque[zenoh.Sample] = deque(maxlen=topic.queue)

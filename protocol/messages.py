@@ -138,6 +138,35 @@ class DroneState(Message):
     control: Control | None
     """The decision of the tick before."""
 
+    @property
+    def landed(self) -> bool:
+        return self.mode == "landed"
+
+
+class TeamStates(Message):
+    """What all drones that spoke lately said of where they are, gathered by the router: row k of the first arrays is
+    the newest state of drone ``drones[k]``. Every pose comes in several messages, so that a lost one loses nothing."""
+
+    name: ClassVar[str] = "team_states"
+    drones: WireArray
+    """uint8 (n,), ascending."""
+    ticks: WireArray
+    """int32 (n,); how old a state is."""
+    poses: WireArray
+    """float64 (n, 5), to the last bit as they were sent."""
+    velocities: WireArray
+    """float64 (n, 5)"""
+    blind_s: WireArray
+    """float64 (n,)"""
+    landed: WireArray
+    """uint8 (n,), 1 for a drone that stands on the ground and will stay there."""
+    earlier_rows: WireArray
+    """uint8 (m,), whose earlier poses follow: a row of the arrays above."""
+    earlier_ticks: WireArray
+    """int32 (m,)"""
+    earlier_poses: WireArray
+    """float64 (m, 5)"""
+
 
 class Keyframe(Message):
     """One posed image. The image is a JPEG; the pose is that of the camera, not of the airframe."""

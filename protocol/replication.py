@@ -33,6 +33,7 @@ from protocol.messages import (
 from protocol.mission import Mission
 from protocol.replica import Replica
 from protocol.state_log import HISTORY_TICKS, StateLog
+from protocol.team_states import Sighting
 from protocol.wire import decode
 
 log = logging.getLogger(__name__)
@@ -119,7 +120,7 @@ class Replication:
         if tick.lockstep:
             self._note_head(tick.jump_epoch, tick.next_jump, tick.tick)
 
-    def hear_state(self, state: DroneState) -> bool:
+    def hear_state(self, state: DroneState | Sighting) -> bool:
         """False when it is refused: of a drone that is not in the mission, or of a clock that is wrong."""
         ahead = self._now >= 0 and state.tick > self._now + AHEAD_TICKS
         if ahead or state.drone not in self._drones:

@@ -17,6 +17,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from protocol.access import access_control
+from protocol.aggregator import gathering
 from protocol.bus import Bus, connect
 from protocol.credentials import Credentials, load_credentials, load_register
 from protocol.errors import CredentialsError
@@ -40,18 +41,26 @@ async def route(arguments: Arguments) -> None:
     asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, changed.set)
     if link.credentials is not None:
         with refusals_told(namespace_of(mission.name)):
-            await _guard(mission, link, link.credentials, changed)
-    async with connect(link, mission.name, router=True, uplinks=mission.transport.uplinks):
+            await _guard(mission, link, link.credentials, changed, lockstep=arguments.lockstep)
+    async with (
+        connect(link, mission.name, router=True, uplinks=mission.transport.uplinks) as bus,
+        gathering(bus, mission, lockstep=arguments.lockstep),
+    ):
         log.info("listening at %s", link.endpoint)
         await asyncio.Event().wait()
 
 
-async def _guard(mission: Mission, link: Link, credentials: Credentials, changed: asyncio.Event) -> None:
+async def _guard(
+    mission: Mission, link: Link, credentials: Credentials, changed: asyncio.Event, *, lockstep: bool
+) -> None:
     """Listen, and listen anew whenever the certificates have changed; until cancelled."""
     admitted = _admitted(credentials)
     while True:
         access = access_rules(mission, admitted)
-        async with connect(link, mission.name, router=True, uplinks=mission.transport.uplinks, access=access) as bus:
+        async with (
+            connect(link, mission.name, router=True, uplinks=mission.transport.uplinks, access=access) as bus,
+            gathering(bus, mission, lockstep=lockstep),
+        ):
             log.info("listening at %s for %s", link.endpoint, ", ".join(admitted) or "nobody: issue certificates")
             _watch(bus, admitted)
             credentials, admitted = await _next(credentials, changed)

@@ -8,6 +8,7 @@ import numpy as np
 
 from protocol.geometry import Floats
 from protocol.messages import DroneState
+from protocol.team_states import Sighting
 
 HISTORY_TICKS = 200
 """States older than this are forgotten; a tick is integrated long before."""
@@ -20,7 +21,7 @@ class StateLog:
         self._poses: dict[int, dict[int, Sequence[float]]] = {}
         self._newest: dict[int, tuple[int, Sequence[float]]] = {}
 
-    def hear(self, state: DroneState) -> None:
+    def hear(self, state: DroneState | Sighting) -> None:
         """Also the poses of earlier ticks that it repeats, in case their own messages were lost."""
         for tick, pose in (*state.earlier, (state.tick, state.pose)):
             self._poses.setdefault(tick, {})[state.drone] = pose

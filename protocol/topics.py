@@ -13,8 +13,9 @@ from protocol import messages
 from protocol.wire import MAX_MESSAGE_BYTES, Message
 
 M = TypeVar("M", bound=Message)
-Party = Literal["agent", "ground", "sim", "operator"]
-"""Kinds of process. sim: the internal simulator or the observer; operator: console, command line, live table."""
+Party = Literal["agent", "ground", "sim", "operator", "router"]
+"""Kinds of process. sim: the internal simulator or the observer; operator: console, command line, live table. What the
+router itself reads and writes passes no access rules: they are its own."""
 Priority = Literal["REAL_TIME", "INTERACTIVE_HIGH", "INTERACTIVE_LOW", "DATA_HIGH", "DATA", "DATA_LOW", "BACKGROUND"]
 
 
@@ -61,13 +62,15 @@ _NO_AGE = float("inf")
 _KIB, _MIB = 2**10, 2**20
 
 # fmt: off
-STATE = Topic("drone/{drone}/state", messages.DroneState, ("agent",), ("agent", "ground", "sim", "operator"),
+STATE = Topic("drone/{drone}/state", messages.DroneState, ("agent",), ("agent", "ground", "sim", "operator", "router"),
               "INTERACTIVE_HIGH", 256, 0.4, True, 16 * _KIB)
+TEAM = Topic("team/states", messages.TeamStates, ("router",), ("agent",),
+             "INTERACTIVE_HIGH", 16, 0.4, False, 256 * _KIB)
 KEYFRAME = Topic("drone/{drone}/keyframe", messages.Keyframe, ("agent", "sim"), ("ground", "operator"),
                  "DATA_LOW", 256, _NO_AGE, True, 8 * _MIB)
 SETPOINT = Topic("drone/{drone}/setpoint", messages.Setpoint, ("agent",), ("sim",),
                  "REAL_TIME", 256, 0.5, True, 1 * _KIB, express=True)
-TICK = Topic("clock/tick", messages.Tick, ("sim",), ("agent", "ground", "operator"),
+TICK = Topic("clock/tick", messages.Tick, ("sim",), ("agent", "ground", "operator", "router"),
              "REAL_TIME", 256, 0.5, True, 256 * _KIB, express=True)
 JUMP = Topic("phi/jump", messages.Jump, ("ground",), ("agent", "operator"),
              "DATA_HIGH", 256, _NO_AGE, True, 8 * _MIB)
@@ -96,7 +99,7 @@ STATUS = Topic("status", messages.Status, ("ground",), ("operator",),
 # fmt: on
 
 TOPICS: tuple[Topic[Message], ...] = (  # type: ignore[assignment]  # read-only use of an invariant generic
-    STATE, KEYFRAME, SETPOINT, TICK, JUMP, HEAD, JOURNAL, DIGEST, BLOCKS, DRONE_BLOCKS, PHASE, COMMAND,
+    STATE, TEAM, KEYFRAME, SETPOINT, TICK, JUMP, HEAD, JOURNAL, DIGEST, BLOCKS, DRONE_BLOCKS, PHASE, COMMAND,
     EVENT, GROUND_EVENT, MAP, STATUS,
 )  # fmt: skip
 

@@ -17,6 +17,7 @@ from protocol.mission import (
     Simulation,
     Target,
 )
+from protocol.transport_settings import Transport
 
 FAULTY_S = 36.0
 """All faults have ended by then ..."""
@@ -85,7 +86,8 @@ class Schedule:
 
     def __str__(self) -> str:
         drones = ", ".join(str(drone.id) for drone in self.mission.drones)
-        return "\n  ".join([f"seed {self.seed}, drones {drones}", *map(str, self.events)])
+        states = "" if self.mission.transport.aggregate_above else ", states gathered"
+        return "\n  ".join([f"seed {self.seed}, drones {drones}{states}", *map(str, self.events)])
 
 
 def schedule(seed: int) -> Schedule:
@@ -180,4 +182,5 @@ def _mission(dice: random.Random, seed: int, ids: list[int]) -> Mission:
             Drone(id=number, start=(*slot, 1.2, dice.uniform(-3.0, 3.0), 1.3))
             for number, slot in zip(ids, slots, strict=True)
         ),
+        transport=Transport(aggregate_above=dice.choice((0, 8))),  # gathered states, or each drone's own
     )

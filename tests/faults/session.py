@@ -92,6 +92,20 @@ class Query:
             self._server.answer(self._question, self._replies)
 
 
+class _Subscriber:
+    def __init__(self, session: Session, key: str, handler: Ring | Callable[[Sample], None]) -> None:
+        self._session, self._ring = session, handler if isinstance(handler, Ring) else None
+        self._entry = (key, handler.put if isinstance(handler, Ring) else handler)
+        session.subscribers.append(self._entry)
+
+    def try_recv(self) -> Sample | None:
+        assert self._ring is not None
+        return self._ring.try_recv()
+
+    def undeclare(self) -> None:
+        self._session.subscribers.remove(self._entry)
+
+
 class _Publisher:
     def __init__(self, session: Session, key: str, *, safe: bool) -> None:
         self._session, self._key, self._safe = session, key, safe
@@ -135,7 +149,7 @@ class Session:
         """Tokens that this process believes to be alive, in order."""
         self.hears: Callable[[str, bytes], bytes] | None = None
         """Changes what it hears: a wrong clock, for instance."""
-        self._subscribers: list[tuple[str, Callable[[Sample], None]]] = []
+        self.subscribers: list[tuple[str, Callable[[Sample], None]]] = []
         self.changes = 0
         """Of its connection so far; a timer that was set before the last one is void."""
         self._piled_bytes = 0
@@ -156,11 +170,10 @@ class Session:
 
     def declare_subscriber(
         self, key: str, handler: Ring | Callable[[Sample], None], *, allowed_origin: zenoh.Locality
-    ) -> object:
+    ) -> _Subscriber:
         assert allowed_origin == zenoh.Locality.REMOTE, "a process never hears itself"
         self.require_open()
-        self._subscribers.append((key, handler.put if isinstance(handler, Ring) else handler))
-        return handler
+        return _Subscriber(self, key, handler)
 
     def declare_queryable(self, key: str, callback: Callable[[Query], None]) -> object:
         self.require_open()
@@ -224,13 +237,13 @@ class Session:
             self.up.send(key, payload, pass_on, safe=False)
 
     def wants(self, key: str) -> bool:
-        return any(meet(wanted, key) for wanted, _ in self._subscribers)
+        return any(meet(wanted, key) for wanted, _ in self.subscribers)
 
     def receive(self, key: str, payload: bytes) -> None:
         if self.hears is not None:
             payload = self.hears(key, payload)
         self.network.note(self, key, payload)
-        for wanted, callback in self._subscribers:
+        for wanted, callback in self.subscribers:
             if meet(wanted, key):
                 self.hand_over(len(payload), callback, Sample(key, Payload(payload), zenoh.SampleKind.PUT))
 

@@ -31,6 +31,7 @@ from ground_station.mapper import Mapper
 from ground_station.recording.recorder import Recorder
 from ground_station.results import RunFolder
 from protocol import topics
+from protocol.aggregator import gather, is_gathered
 from protocol.bus import Bus
 from protocol.errors import CovreconError
 from protocol.field import VirtualField
@@ -100,6 +101,18 @@ class Team:
         return ["ground", "sim", *(f"drone/{drone.id}" for drone in self.mission.drones)]
 
     # --- processes -----------------------------------------------------------------------------------------------
+
+    def route(self) -> Process:
+        """The router's own part, which no bad link comes between."""
+        process = Process("router")
+
+        async def gather_or_idle() -> None:
+            if is_gathered(self.mission, lockstep=self.lockstep):
+                bus = Bus(self.network.session(process), lossless=False)  # type: ignore[arg-type]  # all that it uses
+                await gather(bus, self.mission)
+
+        process.start(gather_or_idle())
+        return process
 
     def start(self, role: str) -> None:
         process = Process(role)
@@ -207,8 +220,9 @@ async def flying(mission: Mission, folder: Path, seed: int, *, lockstep: bool = 
         patch("secrets.randbits", team.dice.getrandbits),
         patch("ground_station.report.write_report"),
     ):
+        router = team.route()
         try:
             yield team
         finally:
-            for member in (*team.members.values(), *team.buried):
-                await member.process.bury()
+            for process in (router, *(member.process for member in (*team.members.values(), *team.buried))):
+                await process.bury()

@@ -259,6 +259,30 @@ async def test_what_does_not_wake_is_handled_by_a_poll_and_the_newest_are_kept(g
     assert heard[-room:] == [str(number) for number in range(sent - room, sent)]
 
 
+@pytest.mark.parametrize("wakes", [True, False])
+async def test_a_key_is_heard_no_more_and_then_again(ground: Bus, drone: Bus, wakes: bool) -> None:
+    heard: list[int] = []
+    other: list[int] = []
+    drone.on(topics.HEAD, lambda message: other.append(message.done), wakes=not wakes)
+    for said in (1, 2, 3):
+        if said == 2:
+            drone.off(topics.HEAD, wakes=wakes)
+        else:
+            drone.on(topics.HEAD, lambda message: heard.append(message.done), wakes=wakes)
+        await there(ground, drone, f"round/{said}")
+        ground.put(topics.HEAD, head(said))
+
+        def arrived(said: int = said) -> bool:
+            drone.poll()
+            return other[-1:] == [said]
+
+        blocked_until(arrived)
+        drone.poll()
+
+    assert other == [1, 2, 3]
+    assert heard == [1, 3]
+
+
 async def test_a_key_can_be_heard_both_ways(ground: Bus, drone: Bus) -> None:
     waking: list[int] = []
     polled: list[int] = []

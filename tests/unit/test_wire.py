@@ -33,6 +33,7 @@ from protocol.messages import (
     ReplicaState,
     Setpoint,
     Status,
+    TeamStates,
     Tick,
     VehicleSample,
 )
@@ -130,6 +131,17 @@ EXAMPLES: tuple[Message, ...] = (
     REPLICA,
     PhiDigest(epoch=5, tick=60, sketches=np.array([[0.5, 1.0], [0.25, 0.0]], np.float32)),
     PhiPage(epoch=5, tick=61, next_sequence=1, blocks=np.array([3, 7], np.int32), phi=np.ones((4, 3), np.float32)),
+    TeamStates(
+        drones=np.array([3, 255], np.uint8),
+        ticks=np.array([42, 40], np.int32),
+        poses=np.array([[1.5, 2.5, 3.5, 0.5, 1.25], [-1.5, 2.5, 3.5, 0.5, 1.25]]),
+        velocities=np.zeros((2, 5)),
+        blind_s=np.array([0.0, 1.5]),
+        landed=np.array([0, 1], np.uint8),
+        earlier_rows=np.array([0], np.uint8),
+        earlier_ticks=np.array([41], np.int32),
+        earlier_poses=np.array([[1.5, 2.5, 3.0, 0.5, 1.25]]),
+    ),
     Status(
         phase="flying",
         activity="mapping",
