@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from collections.abc import AsyncIterator, Iterable
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
@@ -32,6 +33,8 @@ PATIENCE_TICKS = 0.5
 """How long states of a tick are waited for after its beat: what comes later is told with the next."""
 LATE_TICKS = 0.5
 """How late a beat may be before states are gathered without it."""
+ABOVE_S = 0.25
+"""How long a router below another waits for that one's gathered states: less than a drone does (`agents.hearing`)."""
 LOOK_S = 0.005
 """How often it is looked whether all states are in."""
 
@@ -112,9 +115,9 @@ class Gatherer:
 
 @asynccontextmanager
 async def gathering(bus: Bus, mission: Mission, *, lockstep: bool) -> AsyncIterator[None]:
-    """Gather while the block runs, if this router is to: of those that hear each other, the one at the top is. Should
-    it fail, the router goes on routing, and drones hear each other by themselves."""
-    if not is_gathered(mission, lockstep=lockstep) or mission.transport.uplinks:
+    """Gather while the block runs, if the mission's router is to. Should that fail, the router goes on routing, and
+    drones hear each other by themselves."""
+    if not is_gathered(mission, lockstep=lockstep):
         yield
         return
     task = asyncio.create_task(gather(bus, mission))
@@ -136,13 +139,22 @@ def _tell_of_failure(task: asyncio.Task[None]) -> None:
 async def gather(bus: Bus, mission: Mission) -> None:
     """Tell the team's states once a tick, until cancelled: as soon as all are in, or half a tick after the beat.
 
-    Without beats, which vehicles that fly by themselves can do without, its own clock goes on.
+    Without beats, which vehicles that fly by themselves can do without, its own clock goes on. Of routers that hear
+    each other the one at the top of the tree tells; one below it is silent while it hears that one.
     """
     gatherer = Gatherer(drone.id for drone in mission.drones)
     bus.on(topics.TICK, gatherer.hear_tick)
     bus.on(topics.STATE, gatherer.hear, wakes=False)
     now_s = asyncio.get_running_loop().time
     served, beaten = -1, True
+    above_s = -math.inf
+
+    def hear_above(_message: TeamStates) -> None:
+        nonlocal above_s
+        above_s = now_s()
+
+    if mission.transport.uplinks:
+        bus.on(topics.TEAM, hear_above, wakes=False)
 
     def is_beaten() -> bool:
         return gatherer.tick != served
@@ -156,5 +168,5 @@ async def gather(bus: Bus, mission: Mission) -> None:
             await asyncio.sleep(LOOK_S)
             bus.poll()
         message = gatherer.take()
-        if message is not None:
+        if message is not None and now_s() - above_s > ABOVE_S:
             bus.put(topics.TEAM, message)

@@ -38,8 +38,6 @@ LARGE = Mission(
     transport=Transport(aggregate_above=2),
 )
 SMALL = LARGE.model_copy(update={"transport": Transport(aggregate_above=3)})
-SITE = LARGE.model_copy(update={"transport": Transport(aggregate_above=2, uplinks=("tcp/127.0.0.1:1",))})
-"""Its router leaves the gathering to the one at the other end of its uplink."""
 Start = Callable[..., "subprocess.Popen[bytes]"]
 
 
@@ -47,11 +45,11 @@ Start = Callable[..., "subprocess.Popen[bytes]"]
 def start(tmp_path: Path, endpoint: str) -> Iterator[Start]:
     started: list[subprocess.Popen[bytes]] = []
 
-    def start(mission: Mission, speed: str = "1") -> subprocess.Popen[bytes]:
-        path = tmp_path / "mission.toml"
+    def start(mission: Mission, speed: str = "1", at: str = endpoint) -> subprocess.Popen[bytes]:
+        path = tmp_path / f"mission-{len(started)}.toml"
         path.write_text(mission_to_toml(mission))
         command = [sys.executable, "-P", "-m", "protocol.router", "--mission", str(path), "--run", str(tmp_path)]
-        router = subprocess.Popen([*command, "--endpoint", endpoint, "--speed", speed], env=environment(os.environ))
+        router = subprocess.Popen([*command, "--endpoint", at, "--speed", speed], env=environment(os.environ))
         started.append(router)
         return router
 
@@ -94,6 +92,10 @@ class Pair:
     gathered: list[list[Sighting]] = field(default_factory=list)
     direct: list[DroneState] = field(default_factory=list)
 
+    @property
+    def newest(self) -> list[Sighting]:
+        return self.gathered[-1] if self.gathered else []
+
     def say(self, tick: int, drones: tuple[int, ...] = DRONES) -> None:
         self.speaker.put(topics.TICK, beat(tick))
         for drone in drones:
@@ -125,7 +127,7 @@ async def test_a_tick_of_a_large_team_comes_as_one_message_with_all_that_was_sai
             before = len(both.gathered)
             both.say(tick)
             assert await both.listener.until(
-                lambda tick=tick: [seen.tick for seen in both.gathered[-1]] == [tick] * len(DRONES), PATIENCE_S
+                lambda tick=tick: [seen.tick for seen in both.newest] == [tick] * len(DRONES), PATIENCE_S
             )
             assert len(both.gathered) - before <= 2, "states that came too late for one come with the next"
         newest = both.gathered[-1]
@@ -141,19 +143,17 @@ async def test_one_that_fell_silent_is_soon_told_of_no_more(endpoint: str, start
         last = await both.say_until(lambda: bool(both.gathered) and len(both.gathered[-1]) == len(DRONES), 0)
         for tick in range(last + 1, last + 40):
             both.say(tick, drones=(1, 3))
-            if await both.listener.until(lambda: [seen.drone for seen in both.gathered[-1]] == [1, 3], LARGE.tick_s):
+            if await both.listener.until(lambda: [seen.drone for seen in both.newest] == [1, 3], LARGE.tick_s):
                 break
         told = [seen.tick for message in both.gathered for seen in message if seen.drone == 2]
 
-    assert [seen.drone for seen in both.gathered[-1]] == [1, 3]
+    assert [seen.drone for seen in both.newest] == [1, 3]
     assert max(told) <= last
     assert told.count(max(told)) <= REPEATED + 1
 
 
-@pytest.mark.parametrize(
-    ("mission", "speed"), [(SMALL, "1"), (LARGE, "max"), (SITE, "1")], ids=["small", "max", "site"]
-)
-async def test_small_teams_lockstep_and_sites_below_another_are_not_gathered(
+@pytest.mark.parametrize(("mission", "speed"), [(SMALL, "1"), (LARGE, "max")], ids=["small", "lockstep"])
+async def test_small_teams_and_lockstep_are_not_gathered(
     endpoint: str, start: Start, mission: Mission, speed: str
 ) -> None:
     start(mission, speed)
@@ -162,6 +162,31 @@ async def test_small_teams_lockstep_and_sites_below_another_are_not_gathered(
         for tick in range(last + 1, last + 10):
             both.say(tick)
             assert not await both.listener.until(lambda: bool(both.gathered), LARGE.tick_s)
+
+
+async def test_of_two_routers_the_one_at_the_top_gathers_and_the_other_when_it_is_cut_off(
+    endpoint: str, start: Start
+) -> None:
+    top = f"unixsock-stream/{endpoint.partition('/')[2]}.top"
+    site = LARGE.model_copy(update={"transport": Transport(aggregate_above=2, uplinks=(top,))})
+    router = start(LARGE, at=top)
+    async with connect(top, LARGE.name) as above:
+        start(site)
+        async with pair(endpoint) as both:
+            heard: list[int] = []
+            above.on(topics.TEAM, lambda message: heard.append(int(message.ticks.max())))
+            last = await both.say_until(lambda: len(heard) > 5, 0)
+            both.gathered.clear()
+            for tick in range(last + 1, last + 20):
+                both.say(tick)
+                assert await both.listener.until(
+                    lambda tick=tick: any(seen.tick == tick for seen in both.newest), PATIENCE_S
+                )
+            assert len(both.gathered) <= 20, "each tick is told once"
+            router.kill()
+            router.wait()
+            both.gathered.clear()
+            await both.say_until(lambda: len(both.gathered) > 5, tick + 1)
 
 
 async def test_a_drone_hears_its_team_through_the_router_and_without_it(endpoint: str, start: Start) -> None:
