@@ -20,6 +20,7 @@ from deploy.export_command import export_app
 from deploy.pki_command import pki_app
 from deploy.recording_command import recording_app
 from deploy.replay_command import replay
+from deploy.traffic_command import traffic
 from protocol.errors import CovreconError, CredentialsError, MissionError, SceneError
 from protocol.guard import require_own_packages
 from protocol.verbs import Verb
@@ -44,6 +45,7 @@ app.command(export_app)
 app.command(pki_app)
 app.command(replay)
 app.command(doctor)
+app.command(traffic)
 app.command(completion_of(app), name="completion")
 
 MissionPath = Annotated[Path, Parameter(help="Mission file (TOML).")]
