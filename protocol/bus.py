@@ -13,8 +13,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import threading
-from collections import Counter, deque
+from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
@@ -24,11 +23,13 @@ from typing import Any, Protocol, TypeVar
 import zenoh
 
 from protocol import service
-from protocol.errors import BusError, MessageError, NoReply, VersionError
+from protocol.errors import BusError, MessageError
+from protocol.message_faults import BusStatistics, MessageFaults
+from protocol.queries import Queries
 from protocol.session import Link, errors_of, open_client, open_router
 from protocol.stuck_links import give_up_stuck_links
 from protocol.topics import Topic, alive_key
-from protocol.wire import Message, decode, encode
+from protocol.wire import Message, encode
 
 M = TypeVar("M", bound=Message)
 T = TypeVar("T")
@@ -55,21 +56,6 @@ class _Subscription:
     handlers: list[Callable[[Any], None]] = field(default_factory=list)
 
 
-@dataclass(slots=True)
-class BusStatistics:
-    refused: Counter[str] = field(default_factory=Counter)
-    """Messages that are too long, do not decode or speak for somebody else, by the key that they came under."""
-    dropped: Counter[str] = field(default_factory=Counter)
-    """Messages and questions that a full queue lost, by topic."""
-    failed: Counter[str] = field(default_factory=Counter)
-    """Messages and questions that made their handler raise, by topic."""
-
-    @property
-    def unused(self) -> int:
-        """All of them."""
-        return self.refused.total() + self.dropped.total() + self.failed.total()
-
-
 class Bus:
     """One process's session. Make it with `connect`; it belongs to the event loop that opened it.
 
@@ -86,7 +72,6 @@ class Bus:
         self._subscriptions: dict[tuple[str, bool], _Subscription] = {}
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._declared: list[object] = []
-        self._answers: set[asyncio.Task[None]] = set()
         self._waiting: list[tuple[Callable[[], bool], asyncio.Future[bool]]] = []
         self._woken = False
         self._closed = False
@@ -96,10 +81,12 @@ class Bus:
         self.gone: set[str] = set()
         """Roles that had one and lost it. Whoever is in neither set may live already: a token may come after what its
         process said."""
-        self.statistics = BusStatistics()
-        self._foreign: set[str] = set()
-        """Keys under which another major version speaks."""
-        self._tell_foreign: Callable[[str], None] = log.error
+        self._faults = MessageFaults()
+        self._queries = Queries(session, self._congestion_control, self._faults)
+
+    @property
+    def statistics(self) -> BusStatistics:
+        return self._faults.statistics
 
     # --- sending -------------------------------------------------------------------------------------------------
 
@@ -163,7 +150,7 @@ class Bus:
 
     def on_foreign(self, tell: Callable[[str], None]) -> None:
         """Have ``tell`` tell people, once for each key, that another major version speaks there; else it is logged."""
-        self._tell_foreign = tell
+        self._faults.tell_foreign = tell
 
     async def until(self, condition: Callable[[], bool], timeout_s: float) -> bool:
         """Wait until ``condition`` holds, checked after each burst of messages; False when time ran out.
@@ -231,31 +218,15 @@ class Bus:
     def _deliver(self, subscription: _Subscription, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
         try:
-            message = _read(subscription.topic, key, sample.payload)
+            message = subscription.topic.read(key, sample.payload)
         except MessageError as error:
-            self._refuse(key, error)
+            self._faults.refuse(key, error)
             return
         for handler in subscription.handlers:
             try:
                 handler(message)
             except Exception as error:  # noqa: BLE001 - a fault in one reader must not cost the others their messages
-                self._fail(subscription.key, error)
-
-    def _refuse(self, key: str, error: MessageError) -> None:
-        """Count, and log the 1st, 2nd, 4th, 8th ...: a storm of bad messages must not fill the disk."""
-        self.statistics.refused[key] += 1
-        count = self.statistics.refused[key]
-        if isinstance(error, VersionError) and key not in self._foreign:
-            self._foreign.add(key)
-            self._tell_foreign(f"{key}: {error}: install the same release on both sides")
-        elif count.bit_count() == 1:
-            log.warning("%s: message %d refused: %s", key, count, error)
-
-    def _fail(self, key: str, error: Exception) -> None:
-        """Likewise."""
-        self.statistics.failed[key] += 1
-        if self.statistics.failed[key].bit_count() == 1:
-            log.error("%s: failure %d", key, self.statistics.failed[key], exc_info=error)
+                self._faults.fail(subscription.key, error)
 
     # --- liveliness ----------------------------------------------------------------------------------------------
 
@@ -299,102 +270,18 @@ class Bus:
     # --- queries -------------------------------------------------------------------------------------------------
 
     def serve(self, topic: Topic[M], answer: Callable[[dict[str, str]], Awaitable[M]], drone: int | str = "") -> None:
-        """Answer queries for ``topic``: ``answer`` runs as a task of the loop with the selector's parameters.
-
-        It refuses a query by `MessageError`, and must end by itself when it waits for something: zenoh does not tell
-        that the asker gave up. At most ``topic.queue`` run at once; further queries get no answer, and are counted.
-        """
-        key = topic.of(drone)
-        places = threading.Semaphore(topic.queue)
-
-        async def reply(query: zenoh.Query) -> None:
-            refusal = b"failed"
-            payload = b""
-            try:
-                payload = encode(await answer(parse_parameters(str(query.parameters))))
-            except MessageError as error:
-                refusal = str(error).encode()
-            except Exception as error:  # noqa: BLE001 - a question must not end the process that is asked
-                self._fail(key, error)
-            try:
-                with errors_of(key):
-                    if payload:
-                        query.reply(key, payload)
-                    else:
-                        query.reply_err(refusal)
-            except BusError as error:
-                log.warning("cannot reply: %s", error)
-
-        def end(query: zenoh.Query, task: asyncio.Task[None]) -> None:
-            self._answers.discard(task)
-            places.release()
-            _drop(query)
-
-        def start(query: zenoh.Query) -> None:
-            task = self._loop.create_task(reply(query))
-            self._answers.add(task)
-            task.add_done_callback(lambda task: end(query, task))
-
-        def arrive(query: zenoh.Query) -> None:
-            if not places.acquire(blocking=False):
-                self.statistics.dropped[key] += 1
-                _drop(query)
-                return
-            try:
-                self._loop.call_soon_threadsafe(start, query)
-            except RuntimeError:  # closed
-                _drop(query)
-
-        with errors_of(key):
-            self._declared.append(self._session.declare_queryable(key, arrive))
+        """Answer queries for ``topic`` (`Queries.serve`)."""
+        self._queries.serve(topic, answer, topic.of(drone))
 
     async def ask(
         self, topic: Topic[M], parameters: str, drone: int | str = "", timeout_s: float = QUERY_TIMEOUT_S
     ) -> M:
-        """The first valid answer to a query.
-
-        Raises:
-            NoReply: nobody answered in time; with zenoh an empty answer is no "no", so ask again.
-        """
-        key = topic.of(drone)
-        replies: list[zenoh.Sample] = []
-        done: asyncio.Future[None] = self._loop.create_future()
-
-        def post(action: Callable[..., object], *arguments: object) -> None:
-            try:
-                self._loop.call_soon_threadsafe(action, *arguments)
-            except RuntimeError:  # the loop is gone, and whoever asked with it
-                return
-
-        def arrive(reply: zenoh.Reply) -> None:
-            if reply.ok is not None:
-                post(replies.append, reply.ok)
-
-        def finish() -> None:
-            post(_settle, done, None)
-
-        callback = zenoh.handlers.Callback(arrive, finish, indirect=False)
-        with errors_of(key):
-            self._session.get(
-                f"{key}?{parameters}",
-                callback,
-                timeout=timeout_s,
-                congestion_control=self._congestion_control,
-                priority=getattr(zenoh.Priority, topic.priority),
-            )
-        await done
-        for sample in replies:
-            try:
-                return _read(topic, key, sample.payload)
-            except MessageError as error:
-                self._refuse(key, error)
-        raise NoReply(f"{key}?{parameters}: no valid answer")
+        """The first valid answer to a query (`Queries.ask`)."""
+        return await self._queries.ask(topic, parameters, topic.of(drone), timeout_s)
 
     async def close(self) -> None:
         self._closed = True
-        for task in self._answers:
-            task.cancel()
-        await asyncio.gather(*self._answers, return_exceptions=True)
+        await self._queries.close()
         # Closing joins zenoh's threads, which may be about to call into this loop.
         try:
             with errors_of("close"):
@@ -441,27 +328,6 @@ async def connect(
         yield bus
     finally:
         await bus.close()
-
-
-def parse_parameters(selector: str) -> dict[str, str]:
-    """``"from=3;to=9"`` as a dictionary."""
-    return {key: value for key, _, value in (part.partition("=") for part in selector.split(";")) if key}
-
-
-def _read(topic: Topic[M], key: str, payload: zenoh.ZBytes) -> M:
-    """Raises `MessageError` for what must not be believed."""
-    if len(payload) > topic.max_bytes:
-        raise MessageError(f"{topic.message.name}: {len(payload)} bytes exceed the limit of {topic.max_bytes}")
-    message = decode(topic.message, payload.to_bytes())
-    contradiction = topic.contradiction(key, message)
-    if contradiction:
-        raise MessageError(f"{topic.message.name}: {contradiction}")
-    return message
-
-
-def _drop(query: zenoh.Query) -> None:
-    """End a query: without it the asker waits for its whole time-out."""
-    query.drop()  # type: ignore[no-untyped-call]  # zenoh's stub leaves it untyped
 
 
 def _settle(future: asyncio.Future[T], result: T) -> None:

@@ -7,16 +7,24 @@ All keys live under the namespace ``covrecon/<mission name>``.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Generic, Literal, TypeVar
+from typing import Generic, Literal, Protocol, TypeVar
 
 from protocol import messages
-from protocol.wire import MAX_MESSAGE_BYTES, Message
+from protocol.errors import MessageError
+from protocol.wire import MAX_MESSAGE_BYTES, Message, decode
 
 M = TypeVar("M", bound=Message)
 Party = Literal["agent", "ground", "sim", "operator", "router"]
 """Kinds of process. sim: the internal simulator or the observer; operator: console, command line, live table. What the
 router itself reads and writes passes no access rules: they are its own."""
 Priority = Literal["REAL_TIME", "INTERACTIVE_HIGH", "INTERACTIVE_LOW", "DATA_HIGH", "DATA", "DATA_LOW", "BACKGROUND"]
+
+
+class Payload(Protocol):
+    """As zenoh hands it over."""
+
+    def __len__(self) -> int: ...
+    def to_bytes(self) -> bytes: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +51,16 @@ class Topic(Generic[M]):
     def of(self, drone: int | str) -> str:
         """The key of one drone, or of all with ``"*"``."""
         return self.key.format(drone=drone)
+
+    def read(self, key: str, payload: Payload) -> M:
+        """The message that came under ``key``. Raises `MessageError` for what must not be believed."""
+        if len(payload) > self.max_bytes:
+            raise MessageError(f"{self.message.name}: {len(payload)} bytes exceed the limit of {self.max_bytes}")
+        message = decode(self.message, payload.to_bytes())
+        contradiction = self.contradiction(key, message)
+        if contradiction:
+            raise MessageError(f"{self.message.name}: {contradiction}")
+        return message
 
     def contradiction(self, key: str, message: Message) -> str:
         """How ``message`` speaks for another drone than the one whose key it came under; empty if it does not.

@@ -11,9 +11,10 @@ import pytest
 
 from faults.buses import PATIENCE_S, page, there
 from protocol import topics
-from protocol.bus import Bus, connect, parse_parameters
+from protocol.bus import Bus, connect
 from protocol.errors import MessageError, NoReply
 from protocol.messages import JournalPage, Jump
+from protocol.queries import parse_parameters
 from protocol.topics import Topic
 from protocol.wire import MAX_MESSAGE_BYTES, encode
 

@@ -11,9 +11,10 @@ import pytest
 from ground_station.commands import CommandDesk, parse_command, refusal
 from ground_station.console import command_sender
 from ground_station.console.command_sender import CommandSender, Progress
-from protocol.bus import Bus, parse_parameters
+from protocol.bus import Bus
 from protocol.errors import NoReply
 from protocol.messages import CommandReply
+from protocol.queries import parse_parameters
 from protocol.topics import COMMAND, Topic
 
 PATIENCE_S = 10.0
