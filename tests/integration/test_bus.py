@@ -323,7 +323,7 @@ async def test_a_handler_that_fails_costs_nobody_else_a_message(
     blocked_until(all_are_in)
     assert heard == list(range(10))
     assert drone.statistics.failed == {topics.HEAD.key: 10}
-    told = [record for record in caplog.records if record.name == "protocol.bus"]
+    told = [record for record in caplog.records if record.name == "protocol.message_faults"]
     assert [record.args for record in told] == [(topics.HEAD.key, count) for count in (1, 2, 4, 8)]
     assert all(record.exc_info and record.exc_info[0] is ZeroDivisionError for record in told)
 
