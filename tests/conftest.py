@@ -16,7 +16,7 @@ settings.load_profile("covrecon")
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist looks for the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Tests that fly missions of processes run one after another, on one worker: they would starve each other of cores.
-    So do those that start a process or two, which may run beside a flight."""
+    So do those that start a process or two, or several that do not mind waiting: they may run beside a flight."""
     for item in items:
         if "light" in item.keywords:
             item.add_marker(pytest.mark.xdist_group("light"))

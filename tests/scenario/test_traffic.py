@@ -20,7 +20,7 @@ FLIGHT_S = 150.0
 WITHIN = 0.2
 
 
-@pytest.mark.processes
+@pytest.mark.light
 @pytest.mark.timeout(180)  # the flight has its own bounds
 @pytest.mark.parametrize("states", ["direct", "gathered"])
 def test_a_drone_s_bandwidth_is_as_planned_within_a_fifth(states: str, tmp_path: Path) -> None:

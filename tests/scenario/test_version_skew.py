@@ -8,7 +8,7 @@ import pytest
 
 from faults.processes import Flight, fly, small_mission
 
-pytestmark = [pytest.mark.processes, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.light, pytest.mark.timeout(180)]
 
 THIS, NEWER, FOREIGN = 1, 3, 5
 """Ids of drones of the three releases; the fourth is of this one too."""
