@@ -42,10 +42,13 @@ for call in (
 socket.socket(socket.AF_INET).close()
 """
 
-pytestmark = pytest.mark.skipif(
-    shutil.which("systemd-analyze") is None or ctypes.util.find_library("seccomp") is None,
-    reason="systemd-analyze and libseccomp are needed (Debian: systemd)",
-)
+pytestmark = [
+    pytest.mark.light,
+    pytest.mark.skipif(
+        shutil.which("systemd-analyze") is None or ctypes.util.find_library("seccomp") is None,
+        reason="systemd-analyze and libseccomp are needed (Debian: systemd)",
+    ),
+]
 
 
 def confined(*command: str | Path) -> subprocess.CompletedProcess[str]:
