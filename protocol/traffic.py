@@ -44,7 +44,11 @@ HEADER_BYTES = 52
 """IPv4 (20), TCP (20) and its time stamps (12): of each segment, and all that an acknowledgement is."""
 MTU_BYTES = 1500
 ACKNOWLEDGED_SHARE = 0.45
-"""Acknowledgements without data for each segment with data: measured 0.32 to 0.50."""
+"""Acknowledgements without data for each segment with data, measured 0.32 to 0.50: of as many ..."""
+BURST_SEGMENTS = 8
+"""... as come with one tick; of a longer burst ..."""
+BURST_SHARE = 0.25
+"""... several are acknowledged at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,11 +107,13 @@ class Traffic:
     """Of one drone's link."""
 
     flows: tuple[Flow, ...]
+    ticks_hz: float
 
     def acknowledgements(self, direction: Direction) -> float:
         """Bytes a second of those that travel in ``direction``."""
         answered = sum(flow.rate_hz * flow.segments for flow in self.flows if flow.direction != direction)
-        return ACKNOWLEDGED_SHARE * HEADER_BYTES * answered
+        steady = min(answered, BURST_SEGMENTS * self.ticks_hz)
+        return HEADER_BYTES * (ACKNOWLEDGED_SHARE * steady + BURST_SHARE * (answered - steady))
 
     def bytes_per_s(self, direction: Direction) -> float:
         told = sum(flow.bytes_per_s for flow in self.flows if flow.direction == direction)
@@ -117,7 +123,8 @@ class Traffic:
 def traffic_of(mission: Mission, drone: int, plan: Plan | None = None) -> Traffic:
     """Of the link between a drone, or whatever computer flies it, and the router."""
     plan = plan or Plan()
-    return Traffic(tuple(_flow(plan.carrier, *told) for told in _told(mission, drone, plan)))
+    flows = tuple(_flow(plan.carrier, *told) for told in _told(mission, drone, plan))
+    return Traffic(flows, mission.controller.rate_hz)
 
 
 def radio_bytes_per_s(mission: Mission, plan: Plan | None = None) -> float:

@@ -101,7 +101,9 @@ class Observer:
                 direct.append(at - epoch_s - tick_s * decode(DroneState, payload).tick)
             elif kind is TeamStates:
                 message = decode(TeamStates, payload)
-                for drone, tick in zip(message.drones.tolist(), message.ticks.tolist(), strict=True):
+                told = [*zip(message.drones.tolist(), message.ticks.tolist(), strict=True)]
+                earlier = message.drones[message.earlier_rows].tolist()
+                for drone, tick in [*told, *zip(earlier, message.earlier_ticks.tolist(), strict=True)]:
                     gathered.setdefault((drone, tick), at - epoch_s - tick_s * tick)
         return direct, list(gathered.values())
 
@@ -225,7 +227,7 @@ def fly(count: int, *, gathered: bool, folder: Path) -> Figures:
         figures.values[f"age_at_drone_p{share}"] = 1e3 * float(np.percentile(arrived_s, share))
         figures.values[f"age_used_p{share}"] = 1e3 * max(report["used_age_s"][str(share)] for report in reports)
     figures.values["arrived"] = len(arrived_s) * mission.tick_s / (count * (after.at_s - before.at_s))
-    figures.values["fallbacks"] = sum(len(report["events"]) for report in reports)
+    figures.values["fallbacks"] = sum(event.startswith("warning") for report in reports for event in report["events"])
     return figures
 
 

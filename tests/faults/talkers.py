@@ -22,7 +22,9 @@ from agents.hearing import Hearing
 from agents.team import Team
 from protocol import topics, traffic_samples
 from protocol.bus import Bus, connect
+from protocol.credentials import identity_of_drone
 from protocol.errors import MessageError
+from protocol.links import link_of
 from protocol.messages import DroneState, PhiPage, Setpoint, Tick, Vector5
 from protocol.mission import Mission
 from protocol.mission_file import load_mission
@@ -103,9 +105,11 @@ async def talk(mission: Mission, endpoint: str, drones: list[int]) -> dict[str, 
     """Until SIGTERM; what is to be reported."""
     ended = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, ended.set)
+    links = {drone: link_of(mission, identity_of_drone(drone), endpoint=endpoint) for drone in drones}
     async with AsyncExitStack() as stack:
         talkers = [
-            Talker(mission, drone, await stack.enter_async_context(connect(endpoint, mission.name))) for drone in drones
+            Talker(mission, drone, await stack.enter_async_context(connect(link, mission.name)))
+            for drone, link in links.items()
         ]
         await ended.wait()
     ages_s = np.concatenate([talker.ages_s[len(talker.ages_s) // 4 :] for talker in talkers])
