@@ -16,7 +16,7 @@ from PIL import Image, UnidentifiedImageError
 
 from ground_station.evaluation import FULL_SAMPLES, LIVE_SAMPLES, Scores, Truth, floor_baseline, load_truth, score
 from ground_station.keyframe_log import KeyframeStore
-from ground_station.mesh_change import GridMeshChange
+from ground_station.mesh_change_choice import make_mesh_change
 from ground_station.reconstruction.backends import make_reconstructor
 from ground_station.reconstruction.reconstructor import Keyframe, Mesh, State
 from protocol import messages
@@ -61,7 +61,7 @@ class Mapper:
         self._mission, self._run, self._log = mission, run, keyframes
         self._rules: dict[int, KeyframeRule] = {}
         self._reconstructor = make_reconstructor(mission)
-        self._change = GridMeshChange(mission.target, mission.feedback, (field.xs, field.ys, field.zs))
+        self._change = make_mesh_change(mission, field)
         self._truth: Truth | None = None
         self._recent: deque[int] = deque(maxlen=self._reconstructor.lookback)
         self._unreadable = 0
@@ -99,13 +99,13 @@ class Mapper:
     def update(self, *, scored: bool) -> MapUpdate:
         """The mesh of all that is fused by now, and where it changed."""
         mesh = self._reconstructor.mesh()
-        return MapUpdate(mesh, self._change.update(mesh.vertices), self._score(mesh, LIVE_SAMPLES) if scored else None)
+        return MapUpdate(mesh, self._change.update(mesh), self._score(mesh, LIVE_SAMPLES) if scored else None)
 
     def finish(self) -> MapUpdate:
         """The last mesh, with what still waited for later views, scored in full."""
         self._reconstructor.flush()
         mesh = self._reconstructor.mesh()
-        return MapUpdate(mesh, self._change.update(mesh.vertices), self._score(mesh, FULL_SAMPLES))
+        return MapUpdate(mesh, self._change.update(mesh), self._score(mesh, FULL_SAMPLES))
 
     def floor_scores(self) -> Scores | None:
         """What nothing but a bare floor scores here."""

@@ -1,4 +1,4 @@
-"""Where the mesh still changes: the map feedback h2 that sends drones back (Coverage-Recon, eq. (5)).
+"""Where the mesh still changes: the map feedback h2 that sends drones back, as vertex counts (Coverage-Recon, eq. (5)).
 
 The evaluation points r_k are the centres of a uniform grid over B, and the field's positions are a lattice as
 well. So the nearest r_k of a vertex is a rounding, and the Gaussian sum factorises into one small matrix per
@@ -7,18 +7,45 @@ axis: exact, and hundreds of times faster than the dense formula.
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import Protocol, TypeAlias
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ground_station.reconstruction.reconstructor import Mesh
 from protocol.errors import ReconstructionError
 from protocol.field import cell_centres
 from protocol.mission import Box, Feedback
 
 Floats: TypeAlias = NDArray[np.float64]
 Counts: TypeAlias = NDArray[np.int32]
+
+
+class MeshChange(Protocol):
+    """One kind of feedback. Used from one thread; the same meshes give the same bytes."""
+
+    def update(self, mesh: Mesh) -> NDArray[np.float32]:
+        """h2 at every position of the field, float32 (positions,), between the previous mesh and this one.
+
+        Never negative, 0 everywhere if nothing changed; with ``feedback.normalisation`` "mean" at most 1. The first
+        mesh is compared with an empty one, and what lies outside B is ignored. Raises ReconstructionError, and keeps
+        the previous mesh, if an array has the wrong shape, a vertex is not finite or a face has no vertex.
+        """
+        ...
+
+
+def checked(mesh: Mesh) -> Mesh:
+    """``mesh``, if it is one; otherwise raises `ReconstructionError`."""
+    vertices, faces = mesh.vertices, mesh.faces
+    for name, array in (("vertices", vertices), ("faces", faces)):
+        if array.ndim != 2 or array.shape[1] != 3:
+            raise ReconstructionError(f"mesh change: {name} must be (N, 3), got {array.shape}")
+    if not np.isfinite(vertices).all():
+        raise ReconstructionError("mesh change: vertices are not finite")
+    if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
+        raise ReconstructionError(f"mesh change: a face has a vertex that is none of the {len(vertices)}")
+    return mesh
 
 
 @njit(cache=True, nogil=True)
@@ -63,6 +90,7 @@ def gaussian_kernel(positions_m: Floats, grid_m: Floats, sigma_m: float, normali
 
 class GridMeshChange:
     """h2 of eq. (5) between consecutive meshes; it depends on a cell's position alone, not on its direction.
+    Implements `MeshChange`.
 
     ``axes`` are the x, y and z coordinates of the field's position lattice (1-D, metres, world frame). Positions
     are ordered with x slowest: index = (ix * ny + iy) * nz + iz.
@@ -88,15 +116,9 @@ class GridMeshChange:
         self._kappa = feedback.kappa
         self._counts: Counts = np.zeros(self._shape, np.int32)
 
-    def update(self, vertices: NDArray[np.float32]) -> NDArray[np.float32]:
-        """h2 at every lattice position, float32 (positions,), between the previous mesh and this one.
-
-        ``vertices`` is (V, 3), metres, world frame; the first mesh is compared with an empty one. Raises
-        ReconstructionError, and keeps the previous mesh, if the shape is wrong.
-        """
-        if vertices.ndim != 2 or vertices.shape[1] != 3:
-            raise ReconstructionError(f"mesh change: vertices must be (V, 3), got {vertices.shape}")
-        counts = count_vertices(np.ascontiguousarray(vertices, dtype=np.float32), self._lower, self._upper, self._shape)
+    def update(self, mesh: Mesh) -> NDArray[np.float32]:
+        vertices = np.ascontiguousarray(checked(mesh).vertices, np.float32)
+        counts = count_vertices(vertices, self._lower, self._upper, self._shape)
         change = counts - self._counts
         self._counts = counts
         weight = np.tanh((change / self._kappa) ** 2) ** 2

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from ground_station.mesh_blocks import MeshBlocks
+from ground_station.mesh_change_choice import make_mesh_change
 from ground_station.reconstruction.backends import make_reconstructor
 from ground_station.reconstruction.reconstructor import Keyframe
+from protocol.field import VirtualField
 from protocol.geometry import camera_rotation
 from protocol.mission import Camera, Mission, Reconstruction, Target
 
@@ -23,8 +25,8 @@ PATCH_PX = 8
 def rehearse(mission: Mission) -> int:
     """Map a flat, randomly patterned floor seen from a camera that moves sideways; how many images were fused.
 
-    Of ``mission`` it takes the backend alone: compiling does not depend on sizes. It takes half a second, or the better
-    part of a minute on a machine that has not compiled yet.
+    Of ``mission`` it takes backend and feedback alone: compiling does not depend on sizes. It takes half a second, or
+    the better part of a minute on a machine that has not compiled yet.
     """
     backend = Reconstruction(backend=mission.reconstruction.backend)
     mission = mission.model_copy(update={"camera": Camera(), "target": Target(), "reconstruction": backend})
@@ -54,5 +56,7 @@ def rehearse(mission: Mission) -> int:
             ]
         )
     reconstructor.flush()
-    MeshBlocks().update(reconstructor.mesh())
+    mesh = reconstructor.mesh()
+    MeshBlocks().update(mesh)
+    make_mesh_change(mission, VirtualField.of(mission.target)).update(mesh)
     return reconstructor.statistics().fused

@@ -153,10 +153,34 @@ class Controller(Settings):
     """a3; the region rows use it too."""
 
 
-class Feedback(Settings):
-    """Jumps of the importance where the mesh still changes, eqs. (4) and (5)."""
+class Cylinder(Settings):
+    """Around a core point along the surface's normal: where M3C2 compares two meshes, eq. (6). The paper states no
+    sizes; ours are in docs/adr/0016."""
 
-    method: Literal["grid", "none"] = "grid"
+    radius_m: Positive = 0.05
+    """Two voxels: a plane has a dozen vertices in it."""
+    half_length_m: Positive = 0.25
+    """Largest displacement that can be measured; what appeared or vanished counts as much. An odd multiple of radius_m:
+    the reference implementation, py4dgeo, cuts the cylinder into so many slabs and loses points between two of them,
+    where with an even number the core point's own plane lies."""
+    points_min: Annotated[int, Field(ge=1)] = 1
+    """Vertices in it from which a mesh has a surface there; 1 as in py4dgeo."""
+
+    @model_validator(mode="after")
+    def _has_an_odd_number_of_slabs(self) -> Self:
+        slabs = self.half_length_m / self.radius_m
+        if round(slabs) % 2 == 0 or not math.isclose(slabs, round(slabs), rel_tol=1e-6):
+            raise ValueError(
+                f"half_length_m {self.half_length_m:g} must be an odd multiple of radius_m {self.radius_m:g}"
+            )
+        return self
+
+
+class Feedback(Settings):
+    """Jumps of the importance where the mesh still changes, eqs. (4) to (6)."""
+
+    method: Literal["grid", "m3c2", "none"] = "grid"
+    """What changes: the number of vertices near a point, eq. (5); or how far the surface has moved, eq. (6)."""
     gain: NonNegative = 1.0
     """delta_2'."""
     threshold: Annotated[float, Field(ge=0, le=1)] = 0.5
@@ -166,14 +190,17 @@ class Feedback(Settings):
     delay_s: NonNegative = 1.0
     """Age at which a jump takes effect, the same in every process: time to compute and to travel; at most a period."""
     kappa: Positive = 0.7
-    """Vertex-count change that counts, eq. (5)."""
+    """Vertex-count change that counts, eq. (5); for "grid" alone."""
+    cylinder: Cylinder = Cylinder()
+    """For "m3c2" alone."""
     kernel_m: Positive = 0.4
     """sigma_4."""
     spacing_m: Positive = 0.1
     """Spacing of the evaluation points r_k; not stated in the paper (departure 6). At 0.3 m every point holds
     some vertex that moved, and J hangs at its threshold; at 0.1 m jumps shrink as the map settles (docs/adr/0003)."""
     normalisation: Literal["sum", "mean"] = "mean"
-    """"sum" as printed; "mean" divides by the kernel's weight, so that one jump never exceeds the gain."""
+    """"sum" as printed; "mean" divides by the kernel's weight, with "m3c2" by that on a plane and by the largest
+    displacement, so that one jump never exceeds the gain."""
 
     @model_validator(mode="after")
     def _jumps_before_the_next_mesh(self) -> Self:

@@ -73,7 +73,7 @@ start = [0, 1, 2, 0]
         "m.toml:4: stop_below: must be less than 1, got 1.5",
         "m.toml:6: flight.speed_mx_mps: unknown key, did you mean speed_max_mps?",
         "m.toml:7: flight.separation_m: must be a finite number, got nan",
-        "m.toml:9: feedback.method: must be 'grid' or 'none', got \"gird\"",
+        "m.toml:9: feedback.method: must be 'grid', 'm3c2' or 'none', got \"gird\"",
         "m.toml:10: feedback.kappa: must be a finite number, got inf",
         "m.toml:12: camera.width_px: must be a valid integer, got 320.5",
         "m.toml:13: drones.0.id: is missing",

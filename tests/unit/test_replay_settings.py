@@ -6,7 +6,7 @@ import pytest
 
 from ground_station.replay.settings import with_settings
 from protocol.errors import MissionError
-from protocol.mission import Drone, Mission
+from protocol.mission import Cylinder, Drone, Mission
 
 FLOWN = Mission(drones=(Drone(id=1, start=(0, 0, 2, 0, 1.4)),))
 
@@ -22,6 +22,15 @@ def test_settings_are_changed_and_all_others_stay() -> None:
     assert changed.flight == FLOWN.flight
 
 
+def test_a_setting_in_a_table_of_a_table_can_be_changed() -> None:
+    changed = with_settings(
+        FLOWN, ["feedback.method=m3c2", "feedback.cylinder.radius_m=0.02", "feedback.cylinder.half_length_m=0.1"]
+    )
+
+    assert changed.feedback.method == "m3c2"
+    assert changed.feedback.cylinder == Cylinder(radius_m=0.02, half_length_m=0.1)
+
+
 def test_a_value_that_it_has_already_changes_nothing() -> None:
     assert with_settings(FLOWN, [f"feedback.gain={FLOWN.feedback.gain}"]) == FLOWN
 
@@ -33,6 +42,10 @@ def test_a_value_that_it_has_already_changes_nothing() -> None:
         ("feedback.kappa=0", "feedback.kappa: must be greater than 0, got 0"),
         ("feedback.kappa=high", 'feedback.kappa: must be a valid number, got "high"'),
         ("reconstruction.backend=nerf", "reconstruction.backend: must be 'plane_sweep' or 'none', got \"nerf\""),
+        (
+            "feedback.cylinder.radius_m=0.1",
+            "feedback.cylinder: half_length_m 0.25 must be an odd multiple of radius_m 0.1",
+        ),
         ("feedback.kappa.x=1", "feedback.kappa.x: kappa is no table"),
         ("feedback=1", "feedback=1: must be like feedback.kappa=0.5"),
         ("feedback.kappa", "feedback.kappa: must be like feedback.kappa=0.5"),
