@@ -101,6 +101,21 @@ def test_without_a_map_the_replay_never_jumps(lockstep: Flight) -> None:
     assert f"report: {folder / 'report.html'}" in output
 
 
+def test_a_flight_is_replayed_with_m3c2_feedback_and_that_again_gives_the_same_phi(
+    lockstep: Flight, tmp_path: Path
+) -> None:
+    summaries = []
+    for out in (tmp_path / "once", tmp_path / "again"):
+        code, output = covrecon("replay", lockstep.folder, "--set", "feedback.method=m3c2", "--out", out)
+        assert code == 0, output
+        summaries.append(json.loads((out / "summary.json").read_text()))
+
+    flown = json.loads((lockstep.folder / "summary.json").read_text())
+    assert summaries[0]["phi_sha256"] == summaries[1]["phi_sha256"] != flown["phi_sha256"]
+    assert summaries[0]["mesh_sha256"] == flown["mesh_sha256"]
+    assert summaries[0]["jumps"] > 0
+
+
 def test_a_flight_in_real_time_is_replayed_to_the_last_bit(tmp_path: Path) -> None:
     flight = fly(tmp_path, "1")
 

@@ -6,6 +6,7 @@ import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -168,8 +169,13 @@ def test_one_life_after_another_ends_with_the_map_of_a_single_life(station: Stat
     assert len(station.mapper.finish().mesh.faces) == pytest.approx(expected, rel=0.03)
 
 
+@pytest.mark.parametrize("method", ["grid", "m3c2"])
 @pytest.mark.parametrize("with_checkpoint", [True, False])
-def test_a_restart_alone_does_not_make_phi_jump(station: Station, with_checkpoint: bool) -> None:
+def test_a_restart_alone_does_not_make_phi_jump(
+    tmp_path: Path, with_checkpoint: bool, method: Literal["grid", "m3c2"]
+) -> None:
+    feedback = MISSION.feedback.model_copy(update={"method": method})
+    station = Station(tmp_path, MISSION.model_copy(update={"feedback": feedback}))
     station.add(FLIGHT[:CUT])
     assert station.mapper.update(scored=False).change.any()
     state = station.mapper.state()
@@ -177,6 +183,8 @@ def test_a_restart_alone_does_not_make_phi_jump(station: Station, with_checkpoin
     new = station.killed()
     new.mapper.restore(state if with_checkpoint else None)
     assert not new.mapper.update(scored=False).change.any()
+    for life in station.lives:
+        life.log.close()
 
 
 def test_a_repeated_keyframe_stays_refused_after_a_restart(station: Station) -> None:
