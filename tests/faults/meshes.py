@@ -43,6 +43,14 @@ def shuffled(mesh: Mesh, seed: int = 0) -> Mesh:
     return Mesh(mesh.vertices[order], places[rng.permutation(mesh.faces)], mesh.colors[order])
 
 
+def together(first: Mesh, second: Mesh) -> Mesh:
+    return Mesh(
+        np.vstack([first.vertices, second.vertices]),
+        np.vstack([first.faces, second.faces + np.int32(len(first.vertices))]),
+        np.vstack([first.colors, second.colors]),
+    )
+
+
 def furnished(
     box: Box,
     blocks: Sequence[Block] = (),

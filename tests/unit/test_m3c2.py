@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from faults.meshes import Block, furnished, shuffled
+from faults.meshes import Block, furnished, shuffled, together
 from faults.reference_m3c2 import reference_distances
 from ground_station.m3c2 import Cloud, Lattice, changed_cells, core_points, displacements
 from ground_station.m3c2_change import M3C2MeshChange, surface_change
@@ -141,6 +141,15 @@ def test_a_surface_that_moved_out_of_the_cylinder_counts_as_one_that_vanished_an
     cores, normals = core_points(*pair)
     assert set(cores[:, 2].round(6)) == {0.1, 0.7}
     np.testing.assert_array_equal(surface_change(cores, normals, pair, LATTICE, CYLINDER), 0.25)
+
+
+def test_nothing_counts_as_moved_by_more_than_the_half_length() -> None:
+    """Between two sheets of which one is new, the mean is farther from the old one than a cylinder reaches."""
+    pair = clouds(floor(0.30), together(floor(0.52), floor(0.74)))
+    core, normal = np.array([[0.0, 0.0, 0.52]]), np.array([[0.0, 0.0, 1.0]])
+    distances, _ = displacements(core, normal, pair, LATTICE, 0.05, 0.25, EVERYWHERE)
+    np.testing.assert_allclose(distances, 0.33, atol=1e-6)
+    np.testing.assert_array_equal(surface_change(core, normal, pair, LATTICE, CYLINDER), 0.25)
 
 
 def test_fewer_vertices_than_the_least_number_are_no_surface() -> None:
