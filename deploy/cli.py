@@ -14,6 +14,7 @@ from typing import Annotated, Literal, NoReturn
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
+from deploy.bench_command import bench_app
 from deploy.completion_command import completion_of
 from deploy.doctor_command import doctor
 from deploy.export_command import export_app
@@ -43,6 +44,7 @@ app.command(mission_app)
 app.command(recording_app)
 app.command(export_app)
 app.command(pki_app)
+app.command(bench_app)
 app.command(replay)
 app.command(doctor)
 app.command(traffic)

@@ -113,7 +113,7 @@ async def supervise(
     command cannot be started.
     """
     run = _Run(logs, say, restarts)
-    with _interruption() as interrupted:
+    with interruption() as interrupted:
         try:
             async with process_group(private, grace_s) as group:
                 for role in roles:
@@ -227,7 +227,7 @@ async def _end_group(group: int) -> None:
 
 
 @contextmanager
-def _interruption() -> Iterator[asyncio.Future[signal.Signals]]:
+def interruption() -> Iterator[asyncio.Future[signal.Signals]]:
     """Done once a person or the system asks the run to end."""
     loop = asyncio.get_running_loop()
     received: asyncio.Future[signal.Signals] = loop.create_future()

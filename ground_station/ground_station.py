@@ -310,6 +310,7 @@ class GroundStation:
             phi_sha256=field.sha256,
             wall_time_s=self._board.wall_s(now_s),
             exit_reason=self._reason,
+            feedback_update_s=self._mapper.feedback_update_s,
         )
         self._recorder.metrics(final)
         self._recorder.finished(summary, mesh)

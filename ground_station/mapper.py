@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 import logging
+import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -65,6 +66,7 @@ class Mapper:
         self._truth: Truth | None = None
         self._recent: deque[int] = deque(maxlen=self._reconstructor.lookback)
         self._unreadable = 0
+        self._compared, self._comparing_s = 0, 0.0
         self.refused = 0
         """Images or poses that could not be read, or that the reconstructor cannot use."""
 
@@ -99,7 +101,17 @@ class Mapper:
     def update(self, *, scored: bool) -> MapUpdate:
         """The mesh of all that is fused by now, and where it changed."""
         mesh = self._reconstructor.mesh()
-        return MapUpdate(mesh, self._change.update(mesh), self._score(mesh, LIVE_SAMPLES) if scored else None)
+        began_s = time.perf_counter()
+        change = self._change.update(mesh)
+        self._comparing_s += time.perf_counter() - began_s
+        self._compared += 1
+        return MapUpdate(mesh, change, self._score(mesh, LIVE_SAMPLES) if scored else None)
+
+    @property
+    def feedback_update_s(self) -> float | None:
+        """Mean wall time of one update of the feedback, two meshes to h2; None when there was none."""
+        feeds_back = self._mission.feedback.method != "none"
+        return self._comparing_s / self._compared if feeds_back and self._compared else None
 
     def finish(self) -> MapUpdate:
         """The last mesh, with what still waited for later views, scored in full."""

@@ -97,6 +97,8 @@ class Summary:
     mesh_sha256: str | None
     """Of the final mesh; None if there is none."""
     versions: Mapping[str, str]
+    feedback_update_s: float | None = None
+    """Mean wall time of one update of the feedback, two meshes to h2; None without feedback."""
 
     def as_json(self) -> dict[str, Any]:
         """The content of summary.json: flat where runs are compared, ``null`` for what the run did not have."""
@@ -115,6 +117,7 @@ class Summary:
             "ticks": self.final.tick,
             "sim_time_s": _rounded(self.final.time_s),
             "wall_time_s": _rounded(self.wall_time_s),
+            "feedback_update_s": _rounded(self.feedback_update_s),
             "phi_sha256": self.phi_sha256,
             "mesh_sha256": self.mesh_sha256,
             "versions": dict(self.versions),
@@ -270,7 +273,14 @@ class RunFolder:
             self._faults.took()
 
     def finish(
-        self, final: Metrics, *, floor_baseline: Scores | None, phi_sha256: str, wall_time_s: float, exit_reason: str
+        self,
+        final: Metrics,
+        *,
+        floor_baseline: Scores | None,
+        phi_sha256: str,
+        wall_time_s: float,
+        exit_reason: str,
+        feedback_update_s: float | None = None,
     ) -> Summary:
         """Write the last checkpoint and the summary; the mesh must have been written before.
 
@@ -295,6 +305,7 @@ class RunFolder:
             phi_sha256=phi_sha256,
             mesh_sha256=self._mesh_sha256,
             versions=versions(),
+            feedback_update_s=feedback_update_s,
         )
         text = json.dumps(summary.as_json(), indent=2, allow_nan=False) + "\n"
         self._replace(SUMMARY_FILE, text.encode())

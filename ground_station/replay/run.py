@@ -139,6 +139,7 @@ class _Folder:
             floor_baseline=mapper.floor_scores(),
             phi_sha256=engine.field.sha256,
             wall_time_s=wall_time_s,
+            feedback_update_s=mapper.feedback_update_s,
             exit_reason=reason,
         )
         return write_report(self._run.path)

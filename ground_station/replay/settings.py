@@ -43,11 +43,12 @@ def _assign(raw: dict[str, Any], assignment: str) -> str:
         place = place.get(name)
         if not isinstance(place, dict):
             return f"{key}: {name} is no table"
-    place[names[-1]] = _value(text)
+    place[names[-1]] = value_of(text)
     return ""
 
 
-def _value(text: str) -> Any:
+def value_of(text: str) -> Any:
+    """What the right side of an assignment says: TOML, or a bare word for a text."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except ValueError:

@@ -258,3 +258,21 @@ def test_a_mapper_without_a_map_restarts_as_well(tmp_path: Path) -> None:
     assert new.faces() == 0
     old.log.close()
     new.log.close()
+
+
+def test_the_mean_time_of_a_feedback_update_is_that_of_the_comparisons_alone(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert station.mapper.feedback_update_s is None
+    instants = iter([10.0, 10.5, 20.0, 21.5])
+    monkeypatch.setattr("ground_station.mapper.time.perf_counter", lambda: next(instants))
+    station.faces()
+    station.faces()
+    assert station.mapper.feedback_update_s == pytest.approx(1.0)
+
+
+def test_without_feedback_no_time_of_its_update_is_told(tmp_path: Path) -> None:
+    silent = Station(tmp_path, MISSION.model_copy(update={"feedback": Feedback(method="none")}))
+    silent.faces()
+    assert silent.mapper.feedback_update_s is None
+    silent.log.close()

@@ -62,7 +62,10 @@ def fly(run: RunFolder, first: int, last: int) -> None:
 
 
 def finish(run: RunFolder, tick: int = 10) -> dict[str, object]:
-    run.finish(metrics(tick), floor_baseline=FLOOR, phi_sha256="f" * 64, wall_time_s=2.5, exit_reason="duration")
+    run.finish(
+        metrics(tick), floor_baseline=FLOOR, phi_sha256="f" * 64, wall_time_s=2.5, exit_reason="duration",
+        feedback_update_s=0.0123,
+    )  # fmt: skip
     content: dict[str, object] = json.loads((run.path / "summary.json").read_text())
     return content
 
@@ -132,7 +135,8 @@ def test_the_summary_holds_every_figure_by_which_runs_are_compared(folder: RunFo
         "precision_visible": 0.9, "precision_exposed": 0.9, "precision_objects": 0.85,
         "recall_visible": 0.8, "recall_exposed": 0.7, "recall_objects": 0.6,
         "min_separation_m": 2.91, "jumps": 3, "keyframes": 42, "fallbacks": {"1": 0, "4": 3}, "ticks": 10,
-        "sim_time_s": 0.5, "wall_time_s": 2.5, "phi_sha256": "f" * 64, "mesh_sha256": mesh_sha256(VERTICES, FACES),
+        "sim_time_s": 0.5, "wall_time_s": 2.5, "feedback_update_s": 0.0123,
+        "phi_sha256": "f" * 64, "mesh_sha256": mesh_sha256(VERTICES, FACES),
     }  # fmt: skip
     assert isinstance(baseline, dict)
     assert baseline["f_score_visible"] == pytest.approx(2 / 3, abs=1e-6)

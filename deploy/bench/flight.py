@@ -1,0 +1,83 @@
+"""One flight of a study, flown by `covrecon run`'s machinery in a process of its own, and what is kept of it."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import subprocess
+import sys
+from collections.abc import Mapping
+from contextlib import AsyncExitStack
+from pathlib import Path
+from typing import Final
+
+from deploy.local import environment, process_group
+from ground_station.results import MESH_PLY_FILE, METRICS_FILE, MISSION_FILE, SUMMARY_FILE, TRAJECTORIES_FILE
+from ground_station.study.plan_file import TRUTH_MESH_FILE
+from protocol.errors import ProcessError
+
+KEPT: Final = (MISSION_FILE, SUMMARY_FILE, METRICS_FILE, TRAJECTORIES_FILE, MESH_PLY_FILE, TRUTH_MESH_FILE)
+"""Of a run's folder; the rest is large and can be made again."""
+LOG_FILE: Final = "flight.log"
+RUNS: Final = "runs"
+GRACE_S: Final = 15.0
+"""What the flight's launcher gets to end its processes, which get `deploy.local.GRACE_S`, before it is killed."""
+LOG_LINES: Final = 12
+"""Last lines of a failed flight that are shown."""
+
+
+async def fly_in(scratch: Path, mission_json: str) -> dict[str, bytes]:
+    """Fly the mission in the empty folder ``scratch``; the files to keep, by name.
+
+    Cancelled, or if this process dies in whatever way, it ends all that it started. Raises `ProcessError` if the flight
+    fails.
+    """
+    mission, private = scratch / MISSION_FILE, scratch / "private"
+    mission.write_text(mission_json)
+    private.mkdir()
+    # -P keeps the folder that the launcher was called in from shadowing a package.
+    command = (sys.executable, "-P", "-m", "deploy.bench", str(mission), str(scratch / RUNS))
+    async with AsyncExitStack() as stack:
+        group = await stack.enter_async_context(process_group(private, GRACE_S))
+        with (scratch / LOG_FILE).open("wb") as log:
+            launcher = await asyncio.create_subprocess_exec(
+                *command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=environment(os.environ),
+                process_group=group,
+            )
+        try:
+            code = await launcher.wait()
+        finally:
+            await stack.aclose()  # ends it if it has not ended
+            await launcher.wait()
+    if code != 0:
+        raise ProcessError(f"ended with exit code {code}:\n    {_last_words(scratch / LOG_FILE)}")
+    run = (scratch / RUNS / "latest").resolve()
+    kept = {name: (run / name).read_bytes() for name in KEPT if (run / name).exists()}
+    return kept | {LOG_FILE: (scratch / LOG_FILE).read_bytes()}
+
+
+def flown_s(scratch: Path) -> float:
+    """Mission time that the flight in ``scratch`` has flown by now, for people: 0 before its first second."""
+    try:
+        with (scratch / RUNS / "latest" / METRICS_FILE).open("rb") as file:
+            last = file.read().splitlines()[-1]
+        return float(last.partition(b",")[0])
+    except (OSError, ValueError, IndexError):
+        return 0.0
+
+
+def keep(files: Mapping[str, bytes], folder: Path) -> None:
+    """Write ``files`` as the new folder ``folder``, which is there only when it is whole. Raises OSError."""
+    draft = folder.with_name(f".{folder.name}.draft")
+    draft.mkdir(parents=True)
+    for name, content in files.items():
+        (draft / name).write_bytes(content)
+    draft.rename(folder)
+
+
+def _last_words(log: Path) -> str:
+    return "\n    ".join(log.read_text(errors="replace").splitlines()[-LOG_LINES:])
