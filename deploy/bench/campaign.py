@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import json
+import os
 import shutil
 import signal
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AsyncExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -61,9 +64,11 @@ class _Campaign:
     async def run(self) -> int:
         """How many failed."""
         self._flights.mkdir(parents=True, exist_ok=True)
-        for draft in self._flights.glob(".*.draft"):
-            shutil.rmtree(draft)
-        async with self._executor.ready():
+        async with AsyncExitStack() as stack:
+            stack.enter_context(_alone(self._flights))
+            for draft in self._flights.glob(".*.draft"):
+                shutil.rmtree(draft)
+            await stack.enter_async_context(self._executor.ready())
             looking = asyncio.create_task(self._look())
             try:
                 async with asyncio.TaskGroup() as crew:
@@ -110,3 +115,16 @@ class _Campaign:
             await asyncio.sleep(LOOK_S)
             flown = self._executor.flown_s()
             self._watch.flown({name: time_s / self._durations[name] for name, time_s in flown.items()})
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Two studies in one folder would fly the same flights. Raises `ProcessError` if another flies there."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    except BlockingIOError as error:
+        raise ProcessError(f"{folder}: another study is being flown here") from error
+    finally:
+        os.close(descriptor)

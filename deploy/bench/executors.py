@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import AsyncIterator
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from pathlib import Path
@@ -30,15 +31,19 @@ class LocalExecutor:
     """Processes of this machine, as many flights at once as ``slots``."""
 
     def __init__(self, slots: int, scratch: Path) -> None:
-        """Flights are flown in folders of their own below ``scratch``, which are removed."""
+        """Flights are flown in folders of their own below ``scratch``, which is this executor's alone, and removed."""
         self.slots = slots
         self._scratch = scratch
         self._places: dict[str, Path] = {}
 
     @asynccontextmanager
     async def ready(self) -> AsyncIterator[None]:
+        shutil.rmtree(self._scratch, ignore_errors=True)  # of a study that was killed
         self._scratch.mkdir(parents=True, exist_ok=True)
-        yield
+        try:
+            yield
+        finally:
+            shutil.rmtree(self._scratch, ignore_errors=True)
 
     async def fly(self, name: str, mission_json: str) -> dict[str, bytes]:
         with TemporaryDirectory(prefix=f"{name}-", dir=self._scratch, ignore_cleanup_errors=True) as place:

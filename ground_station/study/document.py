@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shutil
 from collections.abc import Iterator, Sequence
@@ -129,11 +130,11 @@ def _teams(rows: Sequence[MethodRow]) -> Iterator[str]:
         return
     one, four = teams[1].spreads, teams[4].spreads
     speedup = one["time_to_0.25_s"].mean / four["time_to_0.25_s"].mean
-    if speedup == speedup:  # both reached it
+    if math.isfinite(speedup):  # both reached it
         printed = paper.QUARTER_S["grid", 1] / paper.QUARTER_S["grid", 4]
-        yield f"Four drones reach J = 0.25 {speedup:.2f} times as fast as one (paper: {printed:.2f} times);"
+        yield f"Four drones reach J = 0.25 in 1/{speedup:.2f} of one drone's time (paper: 1/{printed:.2f})."
     difference = four["f_visible"].mean - one["f_visible"].mean
-    yield f"their F of the visible surface differs from the single drone's by {difference:+.3f}."
+    yield f"Four drones' F of the visible surface is one drone's {difference:+.3f}."
     yield ""
 
 

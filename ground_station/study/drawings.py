@@ -69,8 +69,7 @@ def curves_over_seeds(flights: Sequence[Flown], column: str) -> Bands:
     time_s = np.arange(0.0, last + STEP_S / 2, STEP_S)
     values = []
     for flown in flights:
-        known = np.isfinite(flown.curves[column])
-        at, curve = flown.curves["time_s"][known], flown.curves[column][known]
+        at, curve = flown.points(column)
         values.append(np.interp(time_s, at, curve, left=np.nan) if len(at) else np.full_like(time_s, np.nan))
     stacked = np.array(values)
     return time_s, stacked.mean(axis=0), stacked.min(axis=0), stacked.max(axis=0)
@@ -114,11 +113,13 @@ def draw_portraits(flights: Sequence[Flown], stem: Path) -> list[Path]:
                 importance = flown.curves["importance"]
                 rate = rate_of(flown.curves["time_s"], importance)
                 above.plot(importance, 1e3 * rate, color=colour, linewidth=0.9, label=f"seed {flown.planned.seed}")
-                below.plot(importance, flown.curves["f_score_visible"], color=colour, linewidth=1.1)
+                scored_s, scores = flown.points("f_score_visible")
+                at_score = np.interp(scored_s, flown.curves["time_s"], importance)
+                below.plot(at_score, scores, color=colour, linewidth=1.1)
             above.axhline(0, color=FAINT, linewidth=0.8)
             for axes in (above, below):
                 axes.axvline(each[3], color=JUMP, linewidth=1, linestyle=(0, (4, 3)))
-            above.set(title=f"J_th = {each[3]:.0%}", xlim=(1.02, 0))
+            above.set(title=f"J_th = {100 * each[3]:.0f} %", xlim=(1.02, 0))
             below.set(xlabel="importance J", ylim=(0, 1.02))
         rows[0, 0].set_ylabel("rate of J (1/1000 s)")
         rows[1, 0].set_ylabel("F visible")

@@ -55,6 +55,12 @@ class Flown:
         until = self.curves["time_s"] <= time_s
         return float(self.curves[column][until][-1]) if until.any() else math.nan
 
+    def points(self, column: str) -> tuple[Floats, Floats]:
+        """Mission time and value of the rows that say something new of a curve, (n,) each."""
+        values = self.curves[column]
+        fresh = np.isfinite(values) & (np.diff(values, prepend=np.nan) != 0)
+        return self.curves["time_s"][fresh], values[fresh]
+
     def mesh(self) -> Mesh | None:
         """Read anew each time: a study has more of them than should be in memory."""
         return load_run(self.folder).mesh

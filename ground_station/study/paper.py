@@ -42,5 +42,5 @@ def label(method: Method, drones: int, threshold: float) -> str:
     if drones > 1:
         parts.append(f"{drones} drones")
     if threshold != THRESHOLD:
-        parts.append(f"J_th {threshold:.0%}")
+        parts.append(f"J_th {100 * threshold:.0f} %")
     return ", ".join(parts)

@@ -42,7 +42,7 @@ class PlannedFlight(BaseModel):
     @property
     def name(self) -> str:
         """For people."""
-        parts = [self.method, f"x{self.drones}", f"{self.threshold:.0%}".replace("%", "pc"), Path(self.scene).stem]
+        parts = [self.method, f"x{self.drones}", f"th{100 * self.threshold:.0f}", Path(self.scene).stem]
         return "-".join([*parts, f"seed{self.seed}"])
 
     @property
