@@ -20,6 +20,8 @@ KEPT: Final = (MISSION_FILE, SUMMARY_FILE, METRICS_FILE, TRAJECTORIES_FILE, MESH
 """Of a run's folder; the rest is large and can be made again."""
 LOG_FILE: Final = "flight.log"
 RUNS: Final = "runs"
+POLL_S: Final = 0.2
+"""How often it is looked whether the flight has ended."""
 GRACE_S: Final = 15.0
 """What the flight's launcher gets to end its processes, which get `deploy.local.GRACE_S`, before it is killed."""
 LOG_LINES: Final = 12
@@ -40,8 +42,9 @@ async def fly_in(scratch: Path, mission_json: str) -> dict[str, bytes]:
     async with AsyncExitStack() as stack:
         group = await stack.enter_async_context(process_group(private, GRACE_S))
         with (scratch / LOG_FILE).open("wb") as log:
-            launcher = await asyncio.create_subprocess_exec(
-                *command,
+            # Not asyncio's: Ray's workers run uvloop, which knows no process groups.
+            launcher = subprocess.Popen(  # noqa: ASYNC220  # a few milliseconds
+                command,
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
@@ -49,10 +52,11 @@ async def fly_in(scratch: Path, mission_json: str) -> dict[str, bytes]:
                 process_group=group,
             )
         try:
-            code = await launcher.wait()
+            while (code := launcher.poll()) is None:  # noqa: ASYNC110  # see above
+                await asyncio.sleep(POLL_S)
         finally:
             await stack.aclose()  # ends it if it has not ended
-            await launcher.wait()
+            launcher.wait()
     if code != 0:
         raise ProcessError(f"ended with exit code {code}:\n    {_last_words(scratch / LOG_FILE)}")
     run = (scratch / RUNS / "latest").resolve()

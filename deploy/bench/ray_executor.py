@@ -49,7 +49,7 @@ class RayExecutor:
     def _connect(self) -> None:
         options = {"include_dashboard": False, "num_cpus": self._wished} if self._address is None else {}
         try:
-            self._ray.init(address=self._address or "local", log_to_driver=False, **options)
+            self._ray.init(address=self._address or "local", log_to_driver=False, logging_level="ERROR", **options)
         except (ConnectionError, RuntimeError, ValueError) as error:
             raise ProcessError(f"no Ray cluster at {self._address}: {error}") from error
         # A worker that dies must not fly again unseen: half a flight would count as none.
