@@ -172,6 +172,7 @@ def _study(
         executor = RayExecutor(ray_address, slots)
     else:
         executor = LocalExecutor(slots or cores(), out / "flying")
+    code = 0
     tally = Tally.of(plan.flights, [job.planned for job in left], wish.duration_s)
     terminal = Console(highlight=False)
     with (
@@ -183,9 +184,8 @@ def _study(
             watch.say(f"{len(left)} of {len(jobs)} flights to fly, into {out}")
             compile_everything(left[0].mission)  # here once, and not in all of the first flights at the same time
             code = asyncio.run(fly_all(out, left, executor, watch))
-            if code != 0:
-                return code
-    return _report(out, page)
+    # What flew is told, also beside flights that failed; not after an interrupt, for whoever did that wants to leave.
+    return code if code > 1 else max(code, _report(out, page))
 
 
 def _report(folder: Path, page: Path | None) -> int:
