@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,8 @@ STEP_S = 1.0
 GAIN_STEP_S = 10.0
 """Between two instants of a gain: as live scores come."""
 PANEL_INCHES = (4.6, 3.4)
+TILE_INCHES = (4.6, 3.7)
+"""Of a picture with a title of two lines."""
 PNG_DPI = 130
 BAND_ALPHA = 0.18
 RATE_WINDOW_S = 9
@@ -167,11 +170,12 @@ def draw_gains(flights: Sequence[Flown], duration_s: float, stem: Path) -> list[
     return _saved(draw, stem, columns=len(scenes), rows=len(SURFACES)) if scenes else []
 
 
-def pictures(tiles: Mapping[str, Picture], stem: Path, columns: int) -> list[Path]:
+def pictures(tiles: Mapping[str, Picture], stem: Path, most_columns: int) -> list[Path]:
     """Pictures (height, width, 3) uint8 side by side under their titles; as PNG alone."""
+    columns = min(most_columns, len(tiles))
+    rows = math.ceil(len(tiles) / columns)
 
     def draw(figure: Figure) -> None:
-        rows = -(-len(tiles) // columns)
         places = figure.subplots(rows, columns, squeeze=False).ravel()
         for axes in places:
             axes.set_axis_off()
@@ -179,17 +183,23 @@ def pictures(tiles: Mapping[str, Picture], stem: Path, columns: int) -> list[Pat
             axes.imshow(picture)
             axes.set_title(title, fontsize=9)
 
-    return _saved(draw, stem, columns=columns, rows=-(-len(tiles) // columns), vector=False)
+    return _saved(draw, stem, columns=columns, rows=rows, inches=TILE_INCHES, vector=False)
 
 
 def _saved(
-    draw: Callable[[Figure], None], stem: Path, *, columns: int, rows: int = 1, vector: bool = True
+    draw: Callable[[Figure], None],
+    stem: Path,
+    *,
+    columns: int,
+    rows: int = 1,
+    inches: tuple[float, float] = PANEL_INCHES,
+    vector: bool = True,
 ) -> list[Path]:
     """The same flights give the same bytes."""
     from matplotlib import style
     from matplotlib.figure import Figure
 
-    width, height = PANEL_INCHES
+    width, height = inches
     paths = []
     with style.context(STYLE):
         figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
