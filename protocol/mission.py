@@ -155,7 +155,7 @@ class Controller(Settings):
 
 class Cylinder(Settings):
     """Around a core point along the surface's normal: where M3C2 compares two meshes, eq. (6). The paper states no
-    sizes; ours are in docs/adr/0016."""
+    sizes; ours are in docs/adr/0014."""
 
     radius_m: Positive = 0.05
     """Two voxels: a plane has a dozen vertices in it."""
