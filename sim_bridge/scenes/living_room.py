@@ -7,6 +7,8 @@ from inside only; there is no ceiling.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from sim_bridge.scenes import furniture as f
@@ -23,14 +25,15 @@ OUTSIDE_M = 14.0
 def living_room() -> tuple[Surfaces, list[Image]]:
     """Surfaces without light, and the images that they use."""
     rng = np.random.default_rng(SEED)
-    parts = [_shell(), _sitting_area(rng), _dining_area(), _edges(rng)]
+    parts = [shell(f.material("wallpaper", 2.0), _pictures()), _sitting_area(rng), _dining_area(), _edges(rng)]
     return join(parts), draw_textures(SEED)
 
 
-def _shell() -> Surfaces:
+def shell(wall: Material, pictures: Sequence[Surfaces]) -> Surfaces:
+    """Floor, walls and the paving outside; ``pictures`` are what hangs on each wall, as if it were the one at +y."""
     w, h, out = WALL_M, WALL_HEIGHT_M, OUTSIDE_M
     floor = Material(TEXTURE["floorboards"])
-    wall, paving, trim = f.material("wallpaper", 2.0), f.material("paving", 2.4), f.material("painted", 0.8)
+    paving, trim = f.material("paving", 2.4), f.material("painted", 0.8)
     parts = [quad([(-w, -w, 0), (w, -w, 0), (w, w, 0), (-w, w, 0)], floor, (0, 0, 1, 1))]
     parts.append(quad([(-out, -out, 0), (out, -out, 0), (out, -w, 0), (-out, -w, 0)], paving))
     parts.append(quad([(-out, w, 0), (out, w, 0), (out, out, 0), (-out, out, 0)], paving))
@@ -38,14 +41,20 @@ def _shell() -> Surfaces:
     parts.append(quad([(w, -w, 0), (out, -w, 0), (out, w, 0), (w, w, 0)], paving))
     side = quad([(-w, w, 0), (w, w, 0), (w, w, h), (-w, w, h)], wall)
     skirting = box((2 * w, 0.02, 0.09), trim, (0, w - 0.01, 0), without="zY")
+    for number, hung in enumerate(pictures):
+        parts += [part.moved(yaw_deg=90 * number) for part in (side, skirting, hung)]
+    return join(parts)
+
+
+def _pictures() -> list[Surfaces]:
+    walls = []
     for number in range(4):
-        turned = [side.moved(yaw_deg=90 * number), skirting.moved(yaw_deg=90 * number)]
+        hung = []
         for place, x in enumerate((-1.9, 0.2, 2.0)):
             size = ((0.7, 0.5), (0.55, 0.75), (0.9, 0.6))[(place + number) % 3]
-            hung = f.picture(*size, which=place + number).moved(yaw_deg=180).moved(x, w, 1.55)
-            turned.append(hung.moved(yaw_deg=90 * number))
-        parts += turned
-    return join(parts)
+            hung.append(f.picture(*size, which=place + number).moved(yaw_deg=180).moved(x, WALL_M, 1.55))
+        walls.append(join(hung))
+    return walls
 
 
 def _sitting_area(rng: np.random.Generator) -> Surfaces:

@@ -37,7 +37,7 @@ def find_mesh(spec: str, relative_to: Path) -> Path:
         return found[0]
     if not path.exists():
         raise SceneError(
-            f"{path}: no such scene: neither a built-in name (living_room) nor a file or folder; "
+            f"{path}: no such scene: neither a built-in name (living_room, room-<seed>) nor a file or folder; "
             "simulation.scene is relative to the mission file"
         )
     if path.suffix.lower() not in SUFFIXES:

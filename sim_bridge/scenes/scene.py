@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+import re
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,12 +16,15 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from protocol.errors import SceneError
 from sim_bridge.scenes.surfaces import Surfaces
 from sim_bridge.scenes.texture_set import TextureSet, build_texture_set
 
 log = logging.getLogger(__name__)
 
 BUILT_IN = ("living_room",)
+RANDOM_ROOM = "room-"
+"""A random furnished room is named by this and its seed."""
 _BAKERY = ("scene", "surfaces", "lighting", "texture_set")
 """Modules that every scene's bytes depend on."""
 
@@ -52,7 +56,7 @@ def _quiet(_: str) -> None:
 
 
 def load_scene(spec: str, *, relative_to: Path, cache: Path, on_progress: Callable[[str], None] = _quiet) -> Scene:
-    """The scene called ``spec``: a built-in name, or the path of a mesh file or of a folder that holds one.
+    """The scene called ``spec``: a built-in name, ``room-<seed>``, or the path of a mesh file or of a folder with one.
 
     Paths are taken relative to ``relative_to``. A scene is built on first use and kept under ``cache``;
     ``on_progress`` is told what takes time. Files are read as z-up metres (`sim_bridge.scenes.mesh_file`).
@@ -64,6 +68,12 @@ def load_scene(spec: str, *, relative_to: Path, cache: Path, on_progress: Callab
 
         key = source_digest(*_BAKERY, "living_room", "furniture", "textures")
         return _cached(cache / f"{spec}-{key[:16]}.npz", living_room, spec, on_progress)
+    seed = seed_of(spec)
+    if seed is not None:
+        from sim_bridge.scenes.random_room import random_room
+
+        key = source_digest(*_BAKERY, "random_room", "arrangement", "living_room", "furniture", "textures")
+        return _cached(cache / f"{spec}-{key[:16]}.npz", lambda: random_room(seed), spec, on_progress)
     from sim_bridge.scenes.mesh_file import find_mesh, read_mesh
 
     path = find_mesh(spec, relative_to)
@@ -72,6 +82,21 @@ def load_scene(spec: str, *, relative_to: Path, cache: Path, on_progress: Callab
     content = _digest([*(getattr(surfaces, field.name) for field in fields(surfaces)), *images])
     key = hashlib.sha256((source_digest(*_BAKERY) + content).encode()).hexdigest()
     return _cached(cache / f"file-{key[:16]}.npz", lambda: (surfaces, images), path.name, on_progress)
+
+
+def seed_of(spec: str) -> int | None:
+    """The seed of the random room that ``spec`` names, None for what names none.
+
+    Raises `SceneError` for a bare name that only begins like a random room's.
+    """
+    if not spec.startswith(RANDOM_ROOM) or "/" in spec or Path(spec).suffix:
+        return None
+    seed = spec.removeprefix(RANDOM_ROOM)
+    if not re.fullmatch("0|[1-9][0-9]{0,8}", seed):
+        raise SceneError(
+            f"{spec}: a random room is named {RANDOM_ROOM}<seed>, a seed of 0 to 999999999: {RANDOM_ROOM}7"
+        )
+    return int(seed)
 
 
 def build_scene(surfaces: Surfaces, images: list[NDArray[np.uint8]]) -> Scene:
