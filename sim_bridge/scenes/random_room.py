@@ -22,7 +22,7 @@ ATTEMPTS = 60
 PARCELS_MOST = 4
 WOODS = ("walnut", "birch", "cherry", "painted")
 CLOTHS = ("blue_cloth", "ochre_cloth", "linen", "tartan", "zigzag")
-WALLS = ("wallpaper", "linen", "painted", "paving")
+WALLS = ("wallpaper", "linen", "painted", "clay")
 
 _Make = Callable[[np.random.Generator], list[Piece]]
 

@@ -111,6 +111,22 @@ def test_a_random_room_is_named_by_its_seed() -> None:
     assert [seed_of(name) for name in ("room-0", "room-7", "room-123456789")] == [0, 7, 123456789]
 
 
+def test_a_random_room_is_built_for_its_seed_once_and_kept_by_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seeds: list[int] = []
+
+    def small_room(seed: int) -> tuple[Surfaces, list[np.ndarray]]:
+        seeds.append(seed)
+        return box((1.0 + seed, 1.0, 1.0), Material(0)), [np.full((1, 1, 3), 255, np.uint8)]
+
+    monkeypatch.setattr("sim_bridge.scenes.random_room.random_room", small_room)
+    scenes = [load_scene(name, relative_to=tmp_path, cache=tmp_path) for name in ("room-7", "room-2", "room-7")]
+    assert seeds == [7, 2]
+    assert scenes[0].fingerprint == scenes[2].fingerprint != scenes[1].fingerprint
+    assert sorted(path.name[:7] for path in tmp_path.iterdir()) == ["room-2-", "room-7-"]
+
+
 @pytest.mark.parametrize("name", ["room-x", "room-", "room--1", "room-07", "room-1e3", "room-1234567890", "room-٣"])
 def test_a_name_that_only_begins_like_a_random_room_is_refused(name: str, tmp_path: Path) -> None:
     with pytest.raises(SceneError, match=rf"{name}: a random room is named room-<seed>"):
