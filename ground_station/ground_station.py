@@ -170,8 +170,7 @@ class GroundStation:
             self._board.activity = "fetching phi from the drones"
             self._recovery.proceed(hopeless=self._board.all_lack_phi(tick.live))
         self._recovery.save_if_due()
-        digest = self._replication.take_digest()
-        if digest is not None:
+        for digest in self._replication.take_digests():
             self._bus.put(topics.DIGEST, digest)
         self._board.note_lives(self._bus.alive)
 

@@ -7,6 +7,9 @@ with variance mean(e^2): so a few floats tell the root mean square difference, a
 
 from __future__ import annotations
 
+import math
+from itertools import pairwise, starmap
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +22,10 @@ PAGE_BYTES = 30_000
 above 65,535 bytes, did not."""
 SKETCHES = 4
 """Floats of one block's sketch: its mean, then the signed sums."""
+PART_CELLS = 2**20
+"""Of phi sketched in one tick: 1.5 ms. All 1.5e7 cells of the paper's large field would take half a tick."""
+PART_BYTES = 30_000
+"""Of sketches in one digest: like a page's."""
 
 
 class BlockLayout:
@@ -28,9 +35,14 @@ class BlockLayout:
         """``shape``: positions, directions."""
         self.positions, self.directions = shape
         self.count = -(-self.positions // BLOCK_POSITIONS)
-        self._starts = np.arange(self.count) * BLOCK_POSITIONS
-        cells = np.diff(np.append(self._starts, self.positions)) * self.directions
+        starts = np.arange(self.count) * BLOCK_POSITIONS
+        cells = np.diff(np.append(starts, self.positions)) * self.directions
         self._scale = 1.0 / np.column_stack([cells, *[np.sqrt(cells)] * (SKETCHES - 1)])
+        sketched = self.positions * self.directions / PART_CELLS, self.count * SKETCHES * 4 / PART_BYTES
+        parts = min(self.count, max(1, math.ceil(max(sketched))))
+        ends = [self.count * part // parts for part in range(parts + 1)]
+        self.parts = tuple(starmap(range, pairwise(ends)))
+        """Blocks that are sketched at once; all of them in a small field."""
 
     def rows(self, block: int) -> slice:
         """Its positions."""
@@ -45,14 +57,24 @@ class BlockLayout:
     def blocks_a_page(self) -> int:
         return max(1, PAGE_BYTES // (BLOCK_POSITIONS * self.directions * 4))
 
-    def sketch(self, phi: NDArray[np.float32], tick: int) -> NDArray[np.float32]:
-        """(blocks, SKETCHES) of phi (positions, directions); at one tick equal bytes give equal sketches.
+    def parts_due(self, tick: int, period: int) -> list[range]:
+        """Parts sketched when all ticks before ``tick`` are integrated: each once in ``period`` ticks, evenly spread."""
+        return [
+            part for number, part in enumerate(self.parts) if number * period // len(self.parts) == tick % period
+        ]
+
+    def sketch(self, phi: NDArray[np.float32], tick: int, blocks: range | None = None) -> NDArray[np.float32]:
+        """(blocks, SKETCHES) of phi (positions, directions), of all ``blocks`` if None; at one tick equal bytes give
+        equal sketches.
 
         Every tick has its own signs: a difference that one projection hides, another soon shows.
         """
-        column_signs = _signs(self.directions, salt=2 * tick + 1).astype(np.float32)
-        by_position = (phi @ column_signs).astype(np.float64) * _signs(self.positions, salt=2 * tick)
-        return (np.add.reduceat(by_position, self._starts, axis=0) * self._scale).astype(np.float32)
+        blocks = range(self.count) if blocks is None else blocks
+        rows = slice(self.rows(blocks.start).start, self.rows(blocks.stop - 1).stop)
+        column_signs = _signs(0, self.directions, salt=2 * tick + 1).astype(np.float32)
+        by_position = (phi[rows] @ column_signs).astype(np.float64) * _signs(rows.start, rows.stop, salt=2 * tick)
+        sums = np.add.reduceat(by_position, np.arange(len(blocks)) * BLOCK_POSITIONS, axis=0)
+        return (sums * self._scale[blocks.start : blocks.stop]).astype(np.float32)
 
     def differing(self, one: NDArray[np.float32], other: NDArray[np.float32], tolerance: float) -> list[int]:
         """Blocks whose cells differ by more than about ``tolerance``, root mean square."""
@@ -60,11 +82,12 @@ class BlockLayout:
         return [int(block) for block in np.flatnonzero(apart > tolerance)]
 
 
-def _signs(count: int, salt: int) -> Floats:
-    """(count, SKETCHES): ones for the mean, then +-1 from the bits of a hash (splitmix64; Steele et al., 2014)."""
-    state = (np.arange(count, dtype=np.uint64) + np.uint64(salt << 32)) * np.uint64(0x9E3779B97F4A7C15)
+def _signs(first: int, end: int, salt: int) -> Floats:
+    """(end - first, SKETCHES) of the places from ``first`` on: ones for the mean, then +-1 from the bits of a hash
+    (splitmix64; Steele et al., 2014)."""
+    state = (np.arange(first, end, dtype=np.uint64) + np.uint64(salt << 32)) * np.uint64(0x9E3779B97F4A7C15)
     state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     state ^= state >> np.uint64(31)
     bits = [(state >> np.uint64(k)) & np.uint64(1) for k in range(1, SKETCHES)]
-    return np.column_stack([np.ones(count), *[1.0 - 2.0 * bit for bit in bits]])
+    return np.column_stack([np.ones(end - first), *[1.0 - 2.0 * bit for bit in bits]])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from protocol.field import VirtualField
 from protocol.geometry import Floats
 from protocol.mission import Sensing, Target
-from protocol.sensing import decay_and_terms, owned_shares
+from protocol.sensing import decay_and_terms, owned_shares, raise_positions
 
 SHARE_SAMPLES = 16_000
 """Cells looked at to estimate |V_i|; with them a share of the default field is off by at most 0.01 (tested)."""
@@ -34,12 +34,13 @@ class SamplingTerms:
 class ImportanceField:
     """phi of one replica, float32 [positions, directions], 1 everywhere at the start.
 
-    J is kept by bookkeeping in float64 (each tick's exact loss is subtracted) and counted anew after a jump.
+    J is kept by bookkeeping in float64: each tick's exact loss is subtracted, each jump's exact gain added.
     """
 
     def __init__(self, field: VirtualField, sensing: Sensing) -> None:
         self.field = field
         self.phi: NDArray[np.float32] = np.ones(field.shape, np.float32)
+        self._start = 0
         self._sensing = sensing
         self._sigmas = (sensing.sigma_axis, sensing.sigma_view, sensing.sigma_distance_m)
         self._total = float(field.size)
@@ -54,7 +55,7 @@ class ImportanceField:
 
     @property
     def sha256(self) -> str:
-        return hashlib.sha256(self.phi.astype("<f4", copy=False).tobytes()).hexdigest()
+        return hashlib.sha256(self.phi.astype("<f4", copy=False)).hexdigest()
 
     def advance(self, poses: Floats, dt: float, own: int = -1) -> SamplingTerms:
         """Decay by eq. (2) over ``dt`` seconds with poses (drones, 5) held; ``own`` is the row whose terms are wanted.
@@ -63,6 +64,7 @@ class ImportanceField:
         """
         gradient, first, second, removed = decay_and_terms(
             self.phi,
+            self._start,
             self.field.xs,
             self.field.ys,
             self.field.zs,
@@ -82,22 +84,25 @@ class ImportanceField:
         """The terms of drone ``own`` with poses (drones, 5), without any decay."""
         return self.advance(poses, 0.0, own)
 
-    def overwrite(self, rows: NDArray[np.int64], values: NDArray[np.float32]) -> None:
-        """Set phi at the positions ``rows`` (n,), each given once, to ``values`` (n, directions)."""
-        self._total += float(values.sum(dtype=np.float64) - self.phi[rows].sum(dtype=np.float64))
-        self.phi[rows] = values
+    def overwrite(self, start: int, values: NDArray[np.float32]) -> None:
+        """Set phi at the positions from ``start`` on to ``values`` (n, directions)."""
+        rows = self.phi[start : start + len(values)]
+        self._total += float(values.sum(dtype=np.float64) - rows.sum(dtype=np.float64))
+        rows[:] = values
 
-    def blank(self) -> ImportanceField:
-        """One that is 0 everywhere and changes by itself; the lattice is shared. Costs what is written to it."""
-        twin = copy.copy(self)
-        twin.phi = np.zeros_like(self.phi)
-        twin._total = 0.0  # noqa: SLF001  # of this class
-        return twin
+    def part(self, start: int, values: NDArray[np.float32]) -> ImportanceField:
+        """The positions from ``start`` on alone, with ``values`` (n, directions) of their own that change by
+        themselves. Costs what these positions cost; its importance is their part of J."""
+        part = copy.copy(self)
+        part.phi = np.array(values, np.float32, order="C")
+        part._start = start  # noqa: SLF001  # of this class
+        part._total = float(values.sum(dtype=np.float64))  # noqa: SLF001
+        return part
 
     def jump(self, increments: NDArray[np.float32]) -> None:
         """Add ``increments`` (positions,), equal for all directions of a position: eq. (4) with delta_2 h2 given."""
-        self.phi += increments[:, None]
-        self._total = float(self.phi.sum(dtype=np.float64))
+        own = np.array(increments[self._start : self._start + len(self.phi)])  # numba has no kernel for read-only ones
+        self._total += raise_positions(self.phi, own)
 
     def owned_cells(self, poses: Floats) -> Floats:
         """|V_i| of every drone, (drones,), estimated on a coarse lattice of at most some SHARE_SAMPLES cells."""
@@ -116,3 +121,4 @@ def compile_kernels() -> None:
     field.advance(poses, 0.05, 0)
     field.terms(poses, 0)
     field.owned_cells(poses)
+    field.jump(np.zeros(field.phi.shape[0], np.float32))

@@ -223,7 +223,8 @@ class JournalPage(Message):
 
 
 class PhiDigest(Message):
-    """A sketch of every block of the ground station's phi: replicas that differ fetch those blocks."""
+    """Sketches of blocks of the ground station's phi, of all or, in a large field, of one part of them
+    (`protocol.blocks.BlockLayout.parts`): replicas that differ fetch those blocks."""
 
     name: ClassVar[str] = "phi_digest"
     epoch: Count
@@ -231,6 +232,8 @@ class PhiDigest(Message):
     """All earlier ticks, and the jumps due by it, are in."""
     sketches: WireArray
     """float32 (blocks, `protocol.blocks.SKETCHES`)."""
+    first_block: Count = 0
+    """Which block the first of them is."""
 
 
 class PhiPage(Message):

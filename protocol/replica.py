@@ -102,13 +102,15 @@ class Replica:
 
     def place(self, page: PhiPage) -> None:
         """Put in a page that fits, is placeable and is reached back to, carried forward to this replica's tick."""
-        rows = self.layout.rows_of(page.blocks)
-        carried = self.field.blank()  # positions do not depend on each other: those of the page are enough
-        carried.overwrite(rows, page.phi)
-        for step in self._steps:
-            for jump in step.jumps:
-                if jump.epoch == page.epoch and jump.sequence >= page.next_sequence:  # the page has the others
-                    carried.jump(jump.increments)
-            if step.tick >= page.tick:
-                carried.advance(step.poses, step.dt)
-        self.field.overwrite(rows, carried.phi[rows])
+        first = 0
+        for rows in map(self.layout.rows, page.blocks.tolist()):
+            values = page.phi[first : first + rows.stop - rows.start]
+            first += len(values)
+            carried = self.field.part(rows.start, values)  # positions do not depend on each other
+            for step in self._steps:
+                for jump in step.jumps:
+                    if jump.epoch == page.epoch and jump.sequence >= page.next_sequence:  # the page has the others
+                        carried.jump(jump.increments)
+                if step.tick >= page.tick:
+                    carried.advance(step.poses, step.dt)
+            self.field.overwrite(rows.start, carried.phi)

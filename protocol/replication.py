@@ -94,8 +94,8 @@ class Replication:
         self._wanted_from = 0
         self._resequence = False  # whether the next page tells from which jump on to go on
         self._pages: list[PhiPage] = []
-        self._sketches: dict[int, NDArray[np.float32]] = {}
-        self._digests: dict[int, PhiDigest] = {}
+        self._sketches: dict[tuple[int, int], NDArray[np.float32]] = {}  # by tick and first block
+        self._digests: dict[tuple[int, int], PhiDigest] = {}
         self._reached: list[tuple[int, Callable[[], None]]] = []
         self.known = False
         """Whether phi has been complete once: before, nothing must be decided by it."""
@@ -136,12 +136,13 @@ class Replication:
         self._note_head(head.epoch, head.next_sequence, head.done)
 
     def hear_digest(self, digest: PhiDigest) -> None:
-        fits = digest.sketches.dtype == np.float32 and digest.sketches.shape == (self.replica.layout.count, SKETCHES)
-        if not fits:
+        sketches, first = digest.sketches, digest.first_block
+        fits = sketches.dtype == np.float32 and sketches.ndim == 2 and sketches.shape[1] == SKETCHES
+        if not (fits and range(first, first + len(sketches)) in self.replica.layout.parts):
             self.replica.refused += 1
         elif not self._authority and digest.epoch == self.replica.jumps.epoch:
-            self._digests[digest.tick] = digest
-            self._compare(digest.tick)
+            self._digests[digest.tick, first] = digest
+            self._compare(digest.tick, first)
 
     def hear_journal(self, page: JournalPage, request: JournalRequest) -> None:
         """Raises `MessageError` when a jump of it cannot be read."""
@@ -235,9 +236,8 @@ class Replication:
         self.log.forget_before(tick)
         self._lives = {known: live for known, live in self._lives.items() if known > tick}
         self._place_pages()
-        if self.replica.tick % self._digest_ticks == 0 and self.whole:
-            self._sketches[self.replica.tick] = self.replica.layout.sketch(self.replica.field.phi, self.replica.tick)
-            self._compare(self.replica.tick)
+        if self.whole:
+            self._sketch()
         for reached in [entry for entry in self._reached if entry[0] <= self.replica.tick]:
             self._reached.remove(reached)
             reached[1]()
@@ -255,26 +255,37 @@ class Replication:
 
     # --- comparing, fetching, serving ----------------------------------------------------------------------------
 
-    def take_digest(self) -> PhiDigest | None:
-        """The newest digest of this process's phi, once."""
-        if not self._sketches:
-            return None
-        tick, sketches = self._sketches.popitem()
-        self._sketches.clear()
-        return PhiDigest(epoch=self.replica.jumps.epoch, tick=tick, sketches=sketches)
+    def _sketch(self) -> None:
+        """What is due of this process's phi."""
+        replica = self.replica
+        for blocks in replica.layout.parts_due(replica.tick, self._digest_ticks):
+            sketch = replica.layout.sketch(replica.field.phi, replica.tick, blocks)
+            self._sketches[replica.tick, blocks.start] = sketch
+            self._compare(replica.tick, blocks.start)
 
-    def _compare(self, tick: int) -> None:
+    def take_digests(self) -> list[PhiDigest]:
+        """The newest of this process's phi, of each part that is not taken yet."""
+        newest = {first: (tick, sketches) for (tick, first), sketches in self._sketches.items()}
+        self._sketches.clear()
+        epoch = self.replica.jumps.epoch
+        return [
+            PhiDigest(epoch=epoch, tick=tick, sketches=sketches, first_block=first)
+            for first, (tick, sketches) in newest.items()
+        ]
+
+    def _compare(self, tick: int, first: int) -> None:
         """Find the blocks that differ from the ground station's, once both sketches of ``tick`` are there."""
-        digest, sketch = self._digests.get(tick), self._sketches.get(tick)
+        digest, sketch = self._digests.get((tick, first)), self._sketches.get((tick, first))
         if digest is not None and sketch is not None:
-            differing = self.replica.layout.differing(digest.sketches, sketch, self._mission.replication.tolerance)
+            tolerance = self._mission.replication.tolerance
+            differing = [first + block for block in self.replica.layout.differing(digest.sketches, sketch, tolerance)]
             if differing:
                 log.info("tick %d: %d blocks of phi differ from the ground station's", tick, len(differing))
                 self._wanted.update(differing)
                 self._wanted_from = max(self._wanted_from, tick)
-            del self._digests[tick]
+            del self._digests[tick, first]
         for kept in (self._digests, self._sketches):
-            for old in [known for known in kept if known < tick - HISTORY_TICKS]:
+            for old in [known for known in kept if known[0] < tick - HISTORY_TICKS]:
                 del kept[old]
 
     def _want_all(self, tick: int) -> None:
@@ -316,7 +327,7 @@ class Replication:
 
     def restore(self, phi: NDArray[np.float32], next_sequence: int) -> None:
         """Go on with a phi that was kept (positions, directions); jumps from ``next_sequence`` on are not in it."""
-        self.replica.field.overwrite(np.arange(phi.shape[0]), phi)
+        self.replica.field.overwrite(0, phi)
         self.replica.jumps.restart(self.replica.jumps.epoch, next_sequence)
         self._resequence = False
         self._wanted.clear()

@@ -174,6 +174,7 @@ def _describe(
 @njit(cache=True, nogil=True)
 def decay_and_terms(
     phi: NDArray[np.float32],
+    start: int,
     xs: Floats,
     ys: Floats,
     zs: Floats,
@@ -188,7 +189,8 @@ def decay_and_terms(
 ) -> tuple[Floats, float, float, float]:
     """Advance ``phi`` in place by one step of eq. (2), poses held, and return drone ``own``'s sums before it.
 
-    phi: (positions, directions) float32. poses: (drones, 5), ordered by id. own: row of ``poses``, or -1.
+    phi: (positions, directions) float32, of the lattice's positions from ``start`` on: the others are left out.
+    poses: (drones, 5), ordered by id. own: row of ``poses``, or -1.
     sigmas: sigma_1, sigma_2, sigma_3. decay: delta_1 in 1/s. dt: seconds.
     Returns (gradient, first, second, removed): gradient (5,) = sum over own cells of (dh1/dp) phi,
     first = sum h1 phi, second = sum h1^2 phi, removed = how much the sum of all phi fell.
@@ -221,12 +223,16 @@ def decay_and_terms(
     powers = bits.view(np.float32)
 
     reads = dt == 0.0
+    end, layer = start + phi.shape[0], ys.size * zs.size
     for i in range(drones):
         if reads and i != own:
             continue
-        for ix in range(boxes[i, 0], boxes[i, 1]):
+        for ix in range(max(boxes[i, 0], start // layer), min(boxes[i, 1], (end - 1) // layer + 1)):
             for iy in range(boxes[i, 2], boxes[i, 3]):
                 for iz in range(boxes[i, 4], boxes[i, 5]):
+                    row = (ix * ys.size + iy) * zs.size + iz
+                    if row < start or row >= end:
+                        continue
                     seen = 0
                     mine, mine_r, mine_c1 = -1, 0.0, 0.0
                     for k in range(drones):
@@ -266,9 +272,8 @@ def decay_and_terms(
                     if seen == 0:  # each position once: with the lowest row that senses it
                         continue
 
-                    row = (ix * ys.size + iy) * zs.size + iz
                     sum_h, sum_hh, sum_tc, tx, ty, tz, lost = _decay_position(
-                        phi, row, views_x, views_y, views_z, seen, sight, base, mine, k2, cut, decay * dt,
+                        phi, row - start, views_x, views_y, views_z, seen, sight, base, mine, k2, cut, decay * dt,
                         exponents, owners, senses, values, bits, powers,
                     )  # fmt: skip
                     removed += lost
@@ -290,6 +295,22 @@ def decay_and_terms(
                     gradient[3] += along * (axes[own, 3] * ex + axes[own, 4] * ey + axes[own, 5] * ez)
                     gradient[4] += along * (axes[own, 6] * ex + axes[own, 7] * ey + axes[own, 8] * ez)
     return gradient, first, second, removed
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def raise_positions(phi: Singles, increments: Singles) -> float:
+    """Add ``increments`` (positions,) to all directions of ``phi`` (positions, directions); how much their sum rose."""
+    gained = 0.0
+    for row in range(phi.shape[0]):
+        increment = increments[row]
+        if increment == _ZERO:
+            continue
+        for j in range(phi.shape[1]):
+            before = phi[row, j]
+            after = before + increment
+            gained += np.float64(after) - np.float64(before)
+            phi[row, j] = after
+    return gained
 
 
 @njit(cache=True, nogil=True)

@@ -121,11 +121,11 @@ class Team:
         self.deliver()
         for replication in self.everyone():
             replication.integrate(self.tick, NOBODY, WAIT_TICKS)
-        digest = self.ground.take_digest()
+        digests = self.ground.take_digests()
         head = JumpHead(epoch=self.epoch, next_sequence=len(self.journal), done=self.tick + 7, phase="flying")
         for replication in self.drones.values():
             self.send(replication, head)
-            if digest is not None:
+            for digest in digests:
                 self.send(replication, digest)
         for drone, replication in self.drones.items():
             if drone not in self.unreachable and self.random.random() >= self.loss:
