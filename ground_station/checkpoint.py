@@ -10,6 +10,7 @@ import hashlib
 import json
 import logging
 import math
+import mmap
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -81,7 +82,7 @@ def load_checkpoint(folder: Path, mission: Mission) -> Checkpoint | None:
     return None
 
 
-def _parts(mission: Mission, checkpoint: Checkpoint) -> Iterator[bytes]:
+def _parts(mission: Mission, checkpoint: Checkpoint) -> Iterator[bytes | memoryview]:
     state = checkpoint.map
     arrays = {"phi": checkpoint.phi, **state.reconstruction}
     little = {name: array.astype(array.dtype.newbyteorder("<"), copy=False) for name, array in arrays.items()}
@@ -97,24 +98,24 @@ def _parts(mission: Mission, checkpoint: Checkpoint) -> Iterator[bytes]:
     yield MAGIC
     yield record(json.dumps(description).encode())
     for array in little.values():
-        content = array.tobytes()
+        content = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data  # not copied: phi may be large
         yield head(content)
         yield content
 
 
 def _read(path: Path, mission: Mission) -> Checkpoint:
     """Raises ValueError if it is damaged."""
-    data = path.read_bytes()
-    layout = lay_out(data, len(MAGIC))
-    if not data.startswith(MAGIC) or not layout.contents or layout.damaged or layout.end < len(data):
-        raise ValueError("damaged, or not a checkpoint")
-    first, *spans = layout.contents
-    description = json.loads(data[first.first : first.last])
-    if description["mission"] != _sha256(mission):
-        raise MissionError([f"{path}: is of another mission; take a new run folder: --run FOLDER"])
-    arrays: dict[str, NDArray[Any]] = {}
-    for (name, (dtype, shape)), span in zip(description["arrays"].items(), spans, strict=True):
-        arrays[name] = np.frombuffer(data, dtype, math.prod(shape), span.first).reshape(shape).copy()
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        layout = lay_out(data, len(MAGIC))
+        if data[: len(MAGIC)] != MAGIC or not layout.contents or layout.damaged or layout.end < len(data):
+            raise ValueError("damaged, or not a checkpoint")
+        first, *spans = layout.contents
+        description = json.loads(data[first.first : first.last])
+        if description["mission"] != _sha256(mission):
+            raise MissionError([f"{path}: is of another mission; take a new run folder: --run FOLDER"])
+        arrays: dict[str, NDArray[Any]] = {}
+        for (name, (dtype, shape)), span in zip(description["arrays"].items(), spans, strict=True):
+            arrays[name] = np.frombuffer(data, dtype, math.prod(shape), span.first).reshape(shape).copy()
     return Checkpoint(
         epoch=description["epoch"],
         tick=description["tick"],

@@ -258,7 +258,7 @@ class RunFolder:
         np.savez_compressed(
             content, phi=phi, xs=field.xs, ys=field.ys, zs=field.zs, directions=field.directions, allow_pickle=False
         )
-        self._replace(PHI_FILE, content.getvalue())
+        self._replace(PHI_FILE, content.getbuffer())
 
     def checkpoint(self) -> None:
         """Write trajectories and solver outcomes recorded so far: what is left of them if the process is killed.
@@ -311,7 +311,7 @@ class RunFolder:
         self._replace(SUMMARY_FILE, text.encode())
         return summary
 
-    def _replace(self, name: str, content: bytes) -> None:
+    def _replace(self, name: str, content: bytes | memoryview) -> None:
         try:
             replace_file(self.path / name, [content])
         except OSError as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -26,21 +25,20 @@ def export_importance(source: Source, folder: Path, formats: Sequence[Importance
     """
     importance = source.importance()
     if "npz" in formats:
-        (folder / NPZ_FILE).write_bytes(npz(importance))
+        write_npz(importance, folder / NPZ_FILE)
     if "vtk" in formats:
-        (folder / VTK_FILE).write_bytes(b"".join(vtk(importance, source.mission.target)))
+        with (folder / VTK_FILE).open("wb") as file:
+            file.writelines(vtk(importance, source.mission.target))
     write_georeference(folder, Georeference.of(source.mission))
     positions, directions = importance.phi.shape
     return Exported(folder, f"phi {importance.moment}: {positions} positions, {directions} directions")
 
 
-def npz(importance: Importance) -> bytes:
+def write_npz(importance: Importance, file: Path) -> None:
     """``phi`` float32 (positions, directions), x slowest and z fastest; its lattice ``xs``, ``ys``, ``zs`` in metres;
     ``directions`` (directions, 3) unit vectors from the cell towards the camera."""
     field = importance.field
-    content = io.BytesIO()
-    np.savez_compressed(content, phi=importance.phi, xs=field.xs, ys=field.ys, zs=field.zs, directions=field.directions)
-    return content.getvalue()
+    np.savez_compressed(file, phi=importance.phi, xs=field.xs, ys=field.ys, zs=field.zs, directions=field.directions)
 
 
 def vtk(importance: Importance, target: Target) -> Iterator[bytes]:
@@ -54,8 +52,8 @@ def vtk(importance: Importance, target: Target) -> Iterator[bytes]:
     lengths = [high - low for low, high in zip(target.lower_m, target.upper_m, strict=True)]
     spacing = [length / count for length, count in zip(lengths, counts, strict=True)]
     # VTK has x fastest, and all numbers with the most significant byte first.
-    phi = importance.phi.reshape(*counts, -1).transpose(2, 1, 0, 3).reshape(-1, importance.phi.shape[1])
-    points, directions = phi.shape
+    points, directions = importance.phi.shape
+    phi = importance.phi.reshape(*counts, directions).transpose(2, 1, 0, 3)
     yield (
         "# vtk DataFile Version 3.0\n"
         f"importance phi {importance.moment}\n"
@@ -68,11 +66,12 @@ def vtk(importance: Importance, target: Target) -> Iterator[bytes]:
         "SCALARS importance float 1\n"
         "LOOKUP_TABLE default\n"
     ).encode("ascii")
-    yield phi.mean(axis=1, dtype=np.float64).astype(">f4").tobytes()
+    yield phi.mean(axis=3, dtype=np.float64).astype(">f4").tobytes()
     yield f"\nFIELD FieldData 2\nimportance_max 1 {points} float\n".encode("ascii")
-    yield phi.max(axis=1).astype(">f4").tobytes()
+    yield phi.max(axis=3).astype(">f4").tobytes()
     yield f"\nimportance_by_direction {directions} {points} float\n".encode("ascii")
-    yield phi.astype(">f4").tobytes()
+    for layer in phi:  # one by one: phi may be large
+        yield layer.astype(">f4").tobytes()
     yield b"\n"
 
 

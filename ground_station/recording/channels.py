@@ -12,7 +12,6 @@ from functools import cache
 from typing import Any, Final, Literal, TypeAlias
 
 import foxglove
-import numpy as np
 from foxglove import messages as players
 from pydantic import BaseModel
 from pydantic_core import to_json
@@ -184,8 +183,7 @@ class Channels:
             case "jump":
                 self._store(JUMP, StoredJump.of(content.look, content.jump), time_ns)
             case "phi":
-                importance = content.mean(axis=1, dtype=np.float32)
-                self._show(PHI, shapes.cloud(self._positions, importance, time_ns), time_ns)
+                self._show(PHI, shapes.cloud(self._positions, content, time_ns), time_ns)
             case "mesh":
                 self._show(MESH, shapes.scene(content, time_ns), time_ns)
             case "metrics":

@@ -168,9 +168,9 @@ class Recorder:
             self._offer("mesh", mesh, tick)
 
     def phi(self, tick: int, phi: NDArray[np.float32]) -> None:
-        """phi (positions, directions), copied if it is wanted: it is recorded as often as the map."""
+        """phi (positions, directions), of which each position's mean is recorded, as often as the map."""
         if self._is_due("phi", tick):
-            self._offer("phi", phi.copy(), tick)
+            self._offer("phi", phi.mean(axis=1, dtype=np.float32), tick)
 
     def metrics(self, metrics: Metrics) -> None:
         self._offer("metrics", metrics, metrics.tick)
