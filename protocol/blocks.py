@@ -58,10 +58,8 @@ class BlockLayout:
         return max(1, PAGE_BYTES // (BLOCK_POSITIONS * self.directions * 4))
 
     def parts_due(self, tick: int, period: int) -> list[range]:
-        """Parts sketched when all ticks before ``tick`` are integrated: each once in ``period`` ticks, evenly spread."""
-        return [
-            part for number, part in enumerate(self.parts) if number * period // len(self.parts) == tick % period
-        ]
+        """Those to sketch when all ticks before ``tick`` are in: each once in ``period`` ticks, spread evenly."""
+        return [part for number, part in enumerate(self.parts) if number * period // len(self.parts) == tick % period]
 
     def sketch(self, phi: NDArray[np.float32], tick: int, blocks: range | None = None) -> NDArray[np.float32]:
         """(blocks, SKETCHES) of phi (positions, directions), of all ``blocks`` if None; at one tick equal bytes give

@@ -55,7 +55,7 @@ class ImportanceField:
 
     @property
     def sha256(self) -> str:
-        return hashlib.sha256(self.phi.astype("<f4", copy=False)).hexdigest()
+        return hashlib.sha256(self.phi.astype("<f4", copy=False).data).hexdigest()
 
     def advance(self, poses: Floats, dt: float, own: int = -1) -> SamplingTerms:
         """Decay by eq. (2) over ``dt`` seconds with poses (drones, 5) held; ``own`` is the row whose terms are wanted.

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.blocks import BLOCK_POSITIONS, PAGE_BYTES, SKETCHES, BlockLayout
+from protocol.blocks import BLOCK_POSITIONS, PAGE_BYTES, PART_BYTES, PART_CELLS, SKETCHES, BlockLayout
 
 POSITIONS, DIRECTIONS = 3 * BLOCK_POSITIONS + 10, 42
 LAYOUT = BlockLayout((POSITIONS, DIRECTIONS))
@@ -79,6 +79,32 @@ def test_rounding_alone_is_below_the_tolerance() -> None:
     other = field() * (1 + np.random.default_rng(3).normal(0, 1e-6, (POSITIONS, DIRECTIONS))).astype(np.float32)
 
     assert LAYOUT.differing(LAYOUT.sketch(other, 20), LAYOUT.sketch(field(), 20), TOLERANCE) == []
+
+
+def test_a_small_field_is_sketched_at_once() -> None:
+    assert LAYOUT.parts == (range(LAYOUT.count),)
+    assert [tick for tick in range(40) if LAYOUT.parts_due(tick, 20)] == [0, 20]
+
+
+@pytest.mark.parametrize("shape", [(72_000, 208), (300_000, 1), (500, 40_000), (1, 10**7)])
+@pytest.mark.parametrize("period", [1, 7, 20])
+def test_a_large_field_is_sketched_in_parts_each_once_a_period(shape: tuple[int, int], period: int) -> None:
+    layout = BlockLayout(shape)
+    due = [part for tick in range(300, 300 + period) for part in layout.parts_due(tick, period)]
+
+    assert sorted(block for part in due for block in part) == list(range(layout.count))
+    assert max(len(part) for part in due) * SKETCHES * 4 <= PART_BYTES
+    assert len(layout.parts) == layout.count or all(
+        len(part) * BLOCK_POSITIONS * shape[1] <= 1.1 * PART_CELLS for part in due
+    )
+    if len(layout.parts) <= period:
+        assert max(len(layout.parts_due(tick, period)) for tick in range(period)) <= 1
+
+
+def test_parts_have_the_sketches_that_the_whole_has() -> None:
+    whole = LAYOUT.sketch(field(), 20)
+    for blocks in (range(2), range(2, 3), range(1, LAYOUT.count)):
+        assert LAYOUT.sketch(field(), 20, blocks) == pytest.approx(whole[blocks.start : blocks.stop], rel=1e-5)
 
 
 @pytest.mark.parametrize("directions", [42, 208, 5000])

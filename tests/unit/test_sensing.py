@@ -103,6 +103,35 @@ def test_a_jump_raises_every_direction_of_a_position_alike() -> None:
     assert importance.phi.sum(dtype=np.float64) == importance.field.size + 0.5 * importance.field.shape[1]
 
 
+@pytest.mark.parametrize(("first", "end"), [(0, 32), (1000, 1032), (1391, 1450), (2768, 2800)])
+def test_a_part_of_the_field_changes_as_the_whole_does_to_the_last_bit(first: int, end: int) -> None:
+    field = VirtualField.of(TARGET)
+    whole = ImportanceField(field, Sensing())
+    whole.phi[:] = random_phi(field, seed=2)
+    part = whole.part(first, whole.phi[first:end])
+    poses = np.vstack([random_team(4, seed=3), [[*place, 0.4, 1.3] for place in field.positions()[[first, end - 1]]]])
+    poses[4:, 2] += 1.0  # these two look at the part
+    increments = np.random.default_rng(0).uniform(0, 1, field.shape[0]).astype(np.float32)
+
+    for changed in (whole, part):
+        for own in range(6):
+            changed.advance(poses[: 6 - own], DT, own - 1)
+            changed.jump(increments)
+
+    assert part.phi.tobytes() == whole.phi[first:end].tobytes()
+    assert (part.phi != random_phi(field, seed=2)[first:end] + 6 * increments[first:end, None]).any(), "nobody saw it"
+    assert part.importance == pytest.approx(part.phi.sum(dtype=np.float64) / field.size, abs=1e-12)
+
+
+def test_increments_that_came_over_the_bus_can_be_jumped_by() -> None:
+    """They are read-only."""
+    importance = ImportanceField(VirtualField.of(TARGET), Sensing())
+    increments = np.full(importance.field.shape[0], 0.25, np.float32)
+    importance.jump(np.frombuffer(increments.tobytes(), np.float32))
+    assert (importance.phi == 1.25).all()
+    assert importance.importance == 1.25
+
+
 @pytest.mark.parametrize("drones", [1, 3, 5])
 def test_the_coarse_lattice_estimates_owned_cells_within_a_hundredth_of_the_field(drones: int) -> None:
     field = VirtualField.of(TARGET)
