@@ -7,7 +7,10 @@ slower than it should be is read in the table, not reported as a broken test.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import os
+import platform
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -20,20 +23,40 @@ Record = Callable[..., None]
 
 @pytest.fixture
 def record(request: pytest.FixtureRequest) -> Record:
-    """``record(name, value, unit, against, ratio)``: ``ratio`` says how many times better than ``against``."""
+    """``record(name, value, unit, against, ratio)``: ``ratio`` says how many times better than ``against``. ``curve``:
+    points (x, y) of what it grows with, if that is what was measured."""
     rows = request.config.stash.setdefault(ROWS, [])
+    where = {"machine": machine(), "day": datetime.now(UTC).date().isoformat()}
 
-    def add(name: str, value: float, unit: str, against: str, ratio: float) -> None:
-        rows.append({"name": name, "value": value, "unit": unit, "against": against, "ratio": round(ratio, 2)})
+    def add(
+        name: str, value: float, unit: str, against: str, ratio: float, curve: Sequence[tuple[float, float]] = ()
+    ) -> None:
+        row = {"name": name, "value": float(value), "unit": unit, "against": against, "ratio": round(float(ratio), 2)}
+        rows.append(row | ({"curve": [[float(x), float(y)] for x, y in curve]} if curve else {}) | where)
 
     return add
 
 
+def machine() -> str:
+    """Cores, processor and Python, in words."""
+    try:
+        told = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        told = ""
+    model = next((line.partition(":")[2].strip() for line in told.splitlines() if line.startswith("model name")), "")
+    cores = len(os.sched_getaffinity(0))
+    return f"{cores} cores, {model or platform.machine()}, Python {platform.python_version()}"
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """Rows that this run did not measure stay in the file as they were."""
     rows = config.stash.get(ROWS, [])
     if not rows:
         return
-    RESULTS.write_text(json.dumps(rows, indent=2) + "\n")
+    measured = {row["name"] for row in rows}
+    earlier = json.loads(RESULTS.read_text()) if RESULTS.exists() else []
+    kept = [row for row in earlier if row["name"] not in measured]
+    RESULTS.write_text(json.dumps([*kept, *rows], indent=2) + "\n")
     terminalreporter.section(f"benchmarks, also in {RESULTS.name}")
     for row in rows:
         terminalreporter.write_line(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import statistics
-import time
 from collections.abc import Callable
 
 import numpy as np
@@ -11,8 +9,9 @@ import numpy as np
 from agents.barriers import Barriers, Neighbour, predicted_pose
 from agents.coverage import CoverageController
 from agents.quadratic_program import QuadraticProgram
+from faults.dense_field import dense_tick
+from faults.measure import median_s
 from protocol.field import VirtualField
-from protocol.geometry import Floats, optical_axis
 from protocol.importance import ImportanceField
 from protocol.mission import Drone, Mission, Sensing, Target
 from sim_bridge.dynamics import VehicleBody
@@ -20,53 +19,6 @@ from sim_bridge.dynamics import VehicleBody
 Record = Callable[..., None]
 DT = 0.05
 STARTS = ((0.0, 1.0, 2.0, 0.0, 1.3), (2.0, 1.0, 2.0, 1.0, 1.4), (-2.0, 1.0, 2.0, 2.0, 1.2), (0.0, -2.0, 2.0, 3.0, 1.3))
-
-
-def median_s(action: Callable[[], object], repeats: int) -> float:
-    """Median CPU seconds of one call."""
-    times = []
-    for _ in range(repeats):
-        began = time.process_time()
-        action()
-        times.append(time.process_time() - began)
-    return statistics.median(times)
-
-
-def dense_tick(phi: Floats, cells: Floats, views: Floats, poses: Floats, sensing: Sensing) -> Floats:
-    """Eqs. (1) and (2) and the sums of drone 0's QP row over the list of all cells, as the paper prints them.
-
-    phi (m,), cells and views (m, 3): Pos(q_j) and Dir(q_j).
-    """
-    senses, geometry = [], []
-    for pose in poses:
-        to_cell = cells - pose[:3]
-        r = np.linalg.norm(to_cell, axis=1)
-        sight = to_cell / r[:, None]
-        c1, c2 = sight @ optical_axis(pose[3], pose[4]), -(views * sight).sum(axis=1)
-        senses.append(
-            np.exp(-((1 - c1) ** 2) / (2 * sensing.sigma_axis**2))
-            * np.exp(-((1 - c2) ** 2) / (2 * sensing.sigma_view**2))
-            * np.exp(-((r - sensing.distance_m) ** 2) / (2 * sensing.sigma_distance_m**2))
-        )
-        geometry.append((r, sight, c1, c2))
-    h = np.stack(senses)
-    own = (h.argmax(axis=0) == 0) * h[0] * phi
-    (r, sight, c1, c2), pose = geometry[0], poses[0]
-    axis = optical_axis(pose[3], pose[4])
-    along = own * (1 - c1) / sensing.sigma_axis**2
-    view = own * (1 - c2) / sensing.sigma_view**2
-    outward = own * (r - sensing.distance_m) / sensing.sigma_distance_m**2
-    gradient = np.empty(5)
-    gradient[:3] = (
-        (along / r)[:, None] * (c1[:, None] * sight - axis)
-        + (view / r)[:, None] * (views + c2[:, None] * sight)
-        + outward[:, None] * sight
-    ).sum(axis=0)
-    cy, sy, cp, sp = np.cos(pose[3]), np.sin(pose[3]), np.cos(pose[4]), np.sin(pose[4])
-    gradient[3] = along @ (sight @ np.array([-sy * cp, cy * cp, 0.0]))
-    gradient[4] = along @ (sight @ np.array([-cy * sp, -sy * sp, -cp]))
-    phi *= np.exp(-sensing.decay_per_s * DT * h.max(axis=0))
-    return gradient
 
 
 def test_field_tick(record: Record) -> None:
@@ -77,11 +29,11 @@ def test_field_tick(record: Record) -> None:
     phi = np.ones(field.size)
     cells = field.positions().repeat(directions, axis=0)
     views = np.tile(field.directions, (rows, 1))
-    gradient = dense_tick(phi, cells, views, poses, sensing)
+    gradient = dense_tick(phi, cells, views, poses, sensing, DT)
     terms = importance.advance(poses, DT, 0)
     assert np.allclose(terms.gradient, gradient, rtol=1e-4, atol=1e-4 * np.abs(gradient).max())
     windowed = median_s(lambda: [importance.advance(poses, DT, 0) for _ in range(50)], 15) / 50
-    dense = median_s(lambda: dense_tick(phi, cells, views, poses, sensing), 7)
+    dense = median_s(lambda: dense_tick(phi, cells, views, poses, sensing, DT), 7)
     record("field_tick_117600", windowed * 1e3, "ms CPU", "NumPy over all cells, as printed", dense / windowed)
 
 

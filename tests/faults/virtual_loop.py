@@ -37,6 +37,8 @@ class Process:
         self.role = role
         self.stopped = False
         self.dead = False
+        self.cpu_s = 0.0
+        """What its callbacks took of a real processor, without what it gave to executors."""
         self.tasks: set[asyncio.Task[Any]] = set()
         """Those that have not ended; referred to here, because the code of a task that is collected would run on."""
         self._context = copy_context()
@@ -98,7 +100,9 @@ class _Call:
     def __call__(self) -> None:
         assert self.handle is not None
         if not self.handle.cancelled() and not self._process.holds(self):
+            began_s = time.process_time()
             self._callback(*self._arguments)
+            self._process.cpu_s += time.process_time() - began_s
 
 
 class _JumpingSelector(selectors.SelectSelector):
@@ -178,12 +182,16 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         """Call ``func`` now and give its result `EXECUTOR_S` later, whatever the executor."""
         del executor
         future: asyncio.Future[T] = self.create_future()
+        began_s = time.process_time()
         try:
             result = func(*args)
         except Exception as error:  # noqa: BLE001  # handed to whoever awaits
             self.call_later(EXECUTOR_S, _settle, future, future.set_exception, error)
         else:
             self.call_later(EXECUTOR_S, _settle, future, future.set_result, result)
+        process = _PROCESS.get()
+        if process is not None:
+            process.cpu_s -= time.process_time() - began_s
         return future
 
 

@@ -25,7 +25,7 @@ from protocol.wire import decode, encode
 MISSION = load_mission(Path(__file__).parents[2] / "missions" / "paper-full.toml", drones=2)
 CELLS = 14_976_000
 PHI_BYTES = 4 * CELLS
-SMALL_BYTES = PHI_BYTES // 8
+SMALL_BYTES = PHI_BYTES // 5
 LIMIT_BYTES = 200_000_000
 """Of phi in any process, all copies together."""
 UNCUT_BYTES = 65_535
