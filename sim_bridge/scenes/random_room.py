@@ -19,6 +19,8 @@ FURNISHED_M = 2.97
 """Furniture stands within +- this, inside the paper's target box of +-3 m."""
 ATTEMPTS = 60
 """Places tried for one piece before it is left out; the room is full then."""
+REDRAWS = 10
+"""Of a group for which no place was found: a smaller one may fit."""
 PARCELS_MOST = 4
 WOODS = ("walnut", "birch", "cherry", "painted")
 CLOTHS = ("blue_cloth", "ochre_cloth", "linen", "tartan", "zigzag")
@@ -42,7 +44,7 @@ def furnish(rng: np.random.Generator) -> list[Piece]:
     groups: list[_Make] = [_sitting_group, _dining_group]
     rng.shuffle(groups)
     for make in groups:
-        _place(make(rng), placed, rng, _anywhere)
+        any(_place(make(rng), placed, rng, _anywhere) for _ in range(REDRAWS))
     for number in rng.permutation(len(along_walls)):
         for _ in range(int(rng.integers(1, 3))):
             _place(along_walls[number](rng), placed, rng, _at_a_wall)
@@ -56,12 +58,13 @@ def _place(
     placed: list[Piece],
     rng: np.random.Generator,
     somewhere: Callable[[list[Piece], np.random.Generator], list[Piece]],
-) -> None:
+) -> bool:
     for _ in range(ATTEMPTS):
         tried = somewhere(group, rng)
         if fits(tried, placed, FURNISHED_M):
             placed += tried
-            return
+            return True
+    return False
 
 
 def _anywhere(group: list[Piece], rng: np.random.Generator) -> list[Piece]:
