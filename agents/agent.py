@@ -22,10 +22,11 @@ from prometheus_client import CollectorRegistry
 
 from agents.agent_metrics import AgentMetrics
 from agents.cameras.choice import make_feed
-from agents.coverage import CoverageController, Decision
 from agents.hearing import Hearing
 from agents.homing import Homecoming
 from agents.orders import Orders
+from agents.planners.choice import make_planner
+from agents.planners.planner import Decision
 from agents.policies import Order
 from agents.team import Team
 from agents.vehicles.choice import make_vehicle
@@ -95,7 +96,7 @@ class Agent:
         self._team = Team(drone, starts, mission.flight, mission.tick_s)
         self._replication = Replication(mission, drone)
         self._synchroniser = Synchroniser(bus, self._replication, drone)
-        self._planner = CoverageController(mission, neighbours=len(starts) - 1)
+        self._planner = make_planner(mission, drone)
         self._homecoming = Homecoming(mission, drone, self._planner)
         self._clock = clock_of(mission, bus, lockstep=lockstep, now_s=now_s)
         self._news = News(bus, topics.EVENT, f"drone/{drone}", drone)
@@ -272,6 +273,8 @@ class Agent:
         if self._lockstep:
             await self._bus.until(lambda: bool(self._finished) or ready(tick.tick, self._bus.gone), LOCKSTEP_PATIENCE_S)
         steps = self._replication.integrate(tick.tick, self._bus.gone, self._wait_ticks)
+        for step in steps:
+            self._planner.note_team(step.ids, step.poses)
         if steps and steps[-1].terms is not None:
             return steps[-1].terms
         return self._replication.terms()
@@ -360,7 +363,7 @@ class Agent:
 async def run_agent(mission: Mission, drone: int, link: Link, *, lockstep: bool) -> None:
     """Fly one drone of ``mission`` until it ends."""
     compile_kernels()
-    CoverageController(mission, neighbours=1).rehearse()
+    make_planner(mission, drone).rehearse()
     with MetricsEndpoint(mission, "agent", drone) as served:
         metrics = AgentMetrics(served.registry)
         async with connect(link, mission.name, lossless=lockstep) as bus:

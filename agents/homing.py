@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from agents.barriers import Neighbour
-from agents.coverage import Decision, Planner
+from agents.planners.planner import Decision, Planner
 from protocol.geometry import Floats
 from protocol.mission import Mission
 

@@ -1,6 +1,6 @@
 """One drone's quadratic program through OSQP: set up once, then updated and warm-started every tick.
 
-    minimise   eps |u|^2 + w^2
+    minimise   eps |u|^2 + w^2, and |u_k - wish_k|^2 for every axis k that is held
     subject to xi1 . u + xi2 >= w      (sampling, the only row with slack)
                a_k . u >= b_k          (strict rows)
                low <= u <= high
@@ -9,6 +9,8 @@ The cells' importance makes xi1 and xi2 thousands of times larger than a velocit
 with s of the size of xi1 . u, and the cost divided by |xi2| s: the same program, with coefficients near 1 - but for
 eps, which nearly vanishes. It matters where the sampling row can be met, because then it alone chooses among all the
 velocities that do; `EFFORT_FLOOR` keeps it from sinking below what the solver can tell from nothing.
+The paper's controller holds no axis. The baselines hold some, such as the height: softly, because only the strict rows
+may make the program infeasible.
 Its outcome is a value, never an exception.
 """
 
@@ -22,6 +24,7 @@ import numpy as np
 import osqp
 import scipy.sparse as sparse
 from numba import njit
+from numpy.typing import NDArray
 
 from agents.barriers import Rows
 from protocol.geometry import Floats
@@ -36,6 +39,9 @@ EFFORT_FLOOR = 3e-4
 """Least weight of |u|^2 in the scaled cost; TOLERANCE / EFFORT_FLOOR, 0.03 m/s, is how far u may be from the shortest.
 Measured over flights of two and four drones: without it the velocities that met the sampling row were twice as long as
 the shortest; with it they are within 1 %, and w is off by 1e-4 of xi2."""
+HELD_WEIGHT = 1.0
+"""Weight of |u_k - wish_k|^2 in the scaled cost, in which w weighs 2 at most: a held axis moves as wished to TOLERANCE,
+unless a strict row is in the way."""
 CHECK_EVERY = 5
 """Iterations between two tests of convergence; a warm start often needs no more."""
 ADAPT_EVERY = 200
@@ -54,6 +60,19 @@ _OUTCOMES: dict[int, Outcome] = {
     osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE_INACCURATE: "infeasible",
     osqp.SolverStatus.OSQP_MAX_ITER_REACHED: "out_of_time",
 }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Held:
+    """Axes that are to move as wished, and not as the sampling row asks."""
+
+    axes: NDArray[np.bool_]
+    """(5,)."""
+    wish: Floats
+    """(5,) m/s and rad/s; without a meaning on the other axes."""
+
+
+NOTHING_HELD = Held(np.zeros(5, np.bool_), np.zeros(5))
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +103,8 @@ def _fill(
     bounds: Floats,
     low: Floats,
     high: Floats,
+    held: NDArray[np.bool_],
+    wish: Floats,
     effort: float,
     quadratic: Floats,
     linear: Floats,
@@ -102,6 +123,11 @@ def _fill(
     reach = max(1e-3, reach)
     cost = reach * max(abs(xi2), reach)
     quadratic[:_INPUTS] = max(2 * effort / cost, EFFORT_FLOOR)
+    for i in range(_INPUTS):
+        linear[i] = 0.0
+        if held[i]:
+            quadratic[i] = 2 * HELD_WEIGHT
+            linear[i] = -2 * HELD_WEIGHT * wish[i]
     quadratic[_INPUTS] = 2 * reach * reach / cost
     linear[_INPUTS] = 2 * xi2 * reach / cost
     lower[_BOUNDS:_STRICT] = low
@@ -117,7 +143,7 @@ def _fill(
         for i in range(_INPUTS):
             matrix[i * column + 2 + k] = coefficients[k, i] / length
         lower[_STRICT + k] = bounds[k] / length + TOLERANCE
-    return bool(np.isfinite(matrix.sum() + lower.sum() + upper.sum() + linear[_INPUTS] + cost))
+    return bool(np.isfinite(matrix.sum() + lower.sum() + upper.sum() + linear.sum() + cost))
 
 
 @njit(cache=True, nogil=True)
@@ -175,8 +201,12 @@ class QuadraticProgram:
             polishing=False,
         )
 
-    def solve(self, xi1: Floats, xi2: float, rows: Rows, low: Floats, high: Floats) -> Solution:
+    def solve(
+        self, xi1: Floats, xi2: float, rows: Rows, low: Floats, high: Floats, held: Held = NOTHING_HELD
+    ) -> Solution:
         """``xi1`` (5,) and ``xi2`` of the sampling row; strict ``rows``; bounds ``low``, ``high`` (5,) of u.
+
+        ``xi1`` is 0 along ``held`` axes, or the sampling row would pull at them.
 
         Raises:
             ValueError: there are more rows than room.
@@ -190,6 +220,8 @@ class QuadraticProgram:
             rows.bounds,
             low,
             high,
+            held.axes,
+            held.wish,
             self._effort,
             self._quadratic,
             self._linear,

@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal
 
-from agents.coverage import CoverageController
+from agents.planners.choice import make_planner
 from deploy.local import SETTLE_S, Role, mission_roles, supervise
 from deploy.outcome import describe, read_outcome
 from deploy.progress import Display, follow
@@ -78,7 +78,7 @@ def compile_everything(mission: Mission) -> None:
     (inlined, with fast-math), so without this the first run on a machine would differ from all later ones.
     """
     compile_kernels()
-    CoverageController(mission, neighbours=1).rehearse()
+    make_planner(mission, mission.drones[0].id).rehearse()
     rehearse(mission)
 
 

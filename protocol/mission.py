@@ -15,6 +15,7 @@ from pydantic import Field, model_validator
 
 from protocol.geometry import Intrinsics
 from protocol.operation_settings import Console, Metrics, Recording
+from protocol.planner_settings import PlannerName, Planners, planner_faults
 from protocol.separation import widened_separation
 from protocol.settings import Angle, Metres, NonNegative, Positive, Settings, Vector
 from protocol.transport_settings import Transport
@@ -138,7 +139,8 @@ class Flight(Box):
 class Controller(Settings):
     """The QP of one drone."""
 
-    planner: Literal["coverage"] = "coverage"
+    planner: PlannerName = "coverage"
+    """"coverage" is the paper's; the others are those it compares with, in ``planners``."""
     rate_hz: Positive = 20.0
     """Ticks a second of the whole mission, not of the controller alone (paper)."""
     effort_weight: Positive = 0.01
@@ -307,6 +309,7 @@ class Mission(Settings):
     sensing: Sensing = Sensing()
     flight: Flight = Flight()
     controller: Controller = Controller()
+    planners: Planners = Planners()
     feedback: Feedback = Feedback()
     camera: Camera = Camera()
     reconstruction: Reconstruction = Reconstruction()
@@ -366,6 +369,8 @@ class Mission(Settings):
                 f"flight.pitch_limits_rad: {high - low:g} apart, must be at least {2 * turn:g}:"
                 " the gimbal could pass a limit within one tick"
             )
+        heights = self.flight.lower_m[2], self.flight.upper_m[2]
+        faults += planner_faults(self.controller.planner, self.planners, heights, self.flight.pitch_limits_rad)
         if self.vehicles.kind == "px4":
             faults += self._vehicle_faults()
         else:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from agents.barriers import Barriers, Neighbour, predicted_pose
-from agents.coverage import CoverageController
+from agents.planners.coverage import CoverageController
 from agents.quadratic_program import QuadraticProgram
 from faults.dense_field import dense_tick
 from faults.measure import median_s

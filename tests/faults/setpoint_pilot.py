@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from agents.barriers import Neighbour
-from agents.coverage import CoverageController
+from agents.planners.coverage import CoverageController
 from agents.vehicles.px4.vehicle import Px4Vehicle
 from agents.vehicles.vehicle import Authority
 from protocol.importance import SamplingTerms

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from agents.barriers import FIXED_ROWS, Neighbour, Rows, predicted_pose
-from agents.coverage import CoverageController, Decision
-from agents.quadratic_program import Outcome, Solution
+from agents.planners.coverage import CoverageController
+from agents.planners.planner import Decision
+from agents.quadratic_program import Held, Outcome, Solution
 from protocol.field import VirtualField
 from protocol.geometry import Floats, optical_axis
 from protocol.importance import ImportanceField, SamplingTerms
@@ -39,8 +40,9 @@ class ScriptedProgram:
     strict_rows: int = 99
     asked: list[tuple[Floats, float, Rows]] = field(default_factory=list)
 
-    def solve(self, xi1: Floats, xi2: float, rows: Rows, low: Floats, high: Floats) -> Solution:
+    def solve(self, xi1: Floats, xi2: float, rows: Rows, low: Floats, high: Floats, held: Held) -> Solution:
         assert (low <= high).all()
+        assert not held.axes.any(), "the paper's controller leaves every axis to the sampling row"
         self.asked.append((xi1, xi2, rows))
         return self.answer
 
@@ -56,7 +58,7 @@ def decide(
     """One decision of a controller whose solver says ``outcome`` and, whatever it says, a velocity and a slack."""
     controller = CoverageController(mission, neighbours=2)
     program = ScriptedProgram(Solution(outcome, np.full(5, 0.3), -7.0, ("bound:x",)))
-    controller._program = program  # type: ignore[assignment]
+    controller._filter._program = program  # type: ignore[assignment]
     return controller.decide(pose, velocity, neighbours, terms, CELLS), program
 
 

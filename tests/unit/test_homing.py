@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents.barriers import Neighbour, predicted_pose
-from agents.coverage import CoverageController
 from agents.homing import ARRIVED_M, STUCK_S, Homecoming, down_wish, home_wish
+from agents.planners.coverage import CoverageController
 from protocol.geometry import Floats
 from protocol.mission import Drone, Flight, Mission
 

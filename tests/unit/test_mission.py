@@ -160,3 +160,24 @@ def test_settings_never_change_after_loading() -> None:
 def test_limits_that_one_tick_could_jump_over_are_refused(settings: dict[str, object], said: str) -> None:
     with pytest.raises(ValidationError, match=said):
         Mission.model_validate({"drones": [{"id": 1, "start": (0.0, 0.0, 2.0, 0.0, 1.3)}], **settings})
+
+
+@pytest.mark.parametrize("planner", ["lawnmower", "persistent", "angle_aware_down", "angle_aware"])
+def test_a_baseline_flies_at_a_height_within_the_region(planner: str) -> None:
+    settings = changed(("controller", "planner"), planner)
+    settings["planners"]["altitude_m"] = 5.5
+    assert "planners.altitude_m: 5.5 lies outside the flight region, 0.5 to 5" in faults(settings)
+    settings["controller"]["planner"] = "coverage"
+    Mission.model_validate(settings)
+
+
+@pytest.mark.parametrize("planner", ["lawnmower", "persistent", "angle_aware_down"])
+def test_a_camera_that_is_to_look_down_must_be_able_to(planner: str) -> None:
+    settings = changed(("controller", "planner"), planner)
+    settings["flight"]["pitch_limits_rad"] = (1.0, 1.5)
+    assert f"controller.planner: '{planner}' looks straight down" in faults(settings)
+    settings["flight"]["pitch_limits_rad"] = (1.0, 1.57)
+    Mission.model_validate(settings)
+    settings["flight"]["pitch_limits_rad"] = (1.0, 1.5)
+    settings["controller"]["planner"] = "angle_aware"
+    Mission.model_validate(settings)

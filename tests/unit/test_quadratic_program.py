@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import nnls
 
 from agents.barriers import FIXED_ROWS, Barriers, Neighbour, Rows
-from agents.quadratic_program import ACTIVE, EFFORT_FLOOR, TOLERANCE, QuadraticProgram, Solution
+from agents.quadratic_program import ACTIVE, EFFORT_FLOOR, TOLERANCE, Held, QuadraticProgram, Solution
 from protocol.geometry import Floats
 from protocol.mission import Drone, Flight, Mission
 from protocol.separation import widened_separation
@@ -226,3 +226,43 @@ def test_active_names_the_rows_and_bounds_that_hold_with_equality() -> None:
     assert found.active == ("region:+x", "bound:y")
     assert found.velocity[0] < ACTIVE
     assert found.velocity[1] == pytest.approx(0.5, abs=ACTIVE)
+
+
+HELD = Held(np.array([False, False, True, False, True]), np.array([9.0, 9.0, -0.2, 9.0, 0.1]))
+"""Height and pitch; the other wishes mean nothing."""
+
+
+@pytest.mark.parametrize("scale", [1.0, 300.0, 5000.0])
+def test_held_axes_move_as_wished_and_the_others_as_if_these_were_not_there(scale: float) -> None:
+    """Against the exact method with the held axes pinned by their bounds, where that is possible."""
+    warm, compared = program(), 0
+    for seed in range(200):
+        asked = problem(seed, scale)
+        xi1 = np.where(HELD.axes, 0.0, asked.xi1)
+        pinned = Problem(
+            xi1,
+            asked.xi2,
+            asked.rows,
+            np.where(HELD.axes, HELD.wish, asked.low),
+            np.where(HELD.axes, HELD.wish, asked.high),
+        )
+        found = warm.solve(xi1, asked.xi2, asked.rows, asked.low, asked.high, HELD)
+        assert found.outcome == "solved", seed
+        assert (asked.rows.coefficients @ found.velocity >= asked.rows.bounds).all(), seed
+        if np.abs(found.velocity - HELD.wish)[HELD.axes].max() < 1e-3:  # else a strict row or a bound is in the way
+            compared += 1
+            assert found.slack == pytest.approx(pinned.slack(pinned.reference()), abs=2e-3 * abs(asked.xi2)), seed
+    assert compared > 100
+
+
+def test_a_strict_row_moves_a_held_axis_before_it_is_broken() -> None:
+    below = Neighbour(2, np.array([0.0, 0.0, 1.0]), 0.0)
+    rows = BARRIERS.rows(np.array([0, 0, 2, 0, 1.31]), [below])
+    sinking = Held(np.ones(5, np.bool_), np.array([0.0, 0.0, -0.5, 0.0, 0.0]))
+
+    found = program().solve(np.zeros(5), 0.0, rows, np.full(5, -0.5), np.full(5, 0.5), sinking)
+
+    assert found.outcome == "solved"
+    assert (rows.coefficients @ found.velocity >= rows.bounds).all()
+    assert found.velocity[2] > 0, "away, because it is too near"
+    assert np.abs(found.velocity[[0, 1, 3, 4]]).max() < 1e-3
