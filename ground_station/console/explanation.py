@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -16,11 +16,19 @@ from protocol.geometry import Floats
 from protocol.importance import ImportanceField
 from protocol.messages import Control, DroneState, Vector3, Vector5
 from protocol.mission import Sensing
+from protocol.planner_settings import FREE_AXES, PlannerName
 
 PLACE_RADIUS_M: Final = 0.4
 """Neighbouring cells pull alike: those so near to the strongest are told as one place."""
 STEERED: Final = ("flying", "braking")
-"""Modes in which importance decides where a drone goes."""
+"""Modes in which the planner decides where a drone goes."""
+OTHERS: Final[dict[PlannerName, str]] = {
+    "lawnmower": "sweeps strip by strip with the camera straight down, whatever is of importance",
+    "persistent": "goes by a field of its own, in which importance returns where nobody looks",
+    "angle_aware_down": "feels the pull along x and y alone, at one height with the camera straight down",
+    "angle_aware": "feels the pull along x and y and in the turning of its camera, at one height",
+}
+"""What the planners that the paper compares with do, in words that follow their name."""
 STILL_MPS: Final = 0.01
 """Slower is no motion to speak of."""
 STILL_RADPS: Final = 0.01
@@ -50,18 +58,28 @@ class Explanation:
     opposed: float
     """How much of what they pull is cancelled by cells that pull back, 0 to 1."""
     xi1: Vector5
-    """delta_1 sum over own cells of (dh1/dp) phi, 1/(s m) and 1/(s rad): where to coverage improves fastest."""
+    """delta_1 sum over own cells of (dh1/dp) phi, 1/(s m) and 1/(s rad): where to coverage improves fastest; 0 along
+    the axes on which the planner does not go by phi."""
     lines: tuple[str, ...]
     """In words, one fact each; plain text."""
 
 
 def explain(
-    importance: ImportanceField, sensing: Sensing, states: Mapping[int, DroneState], drone: int, count: int = 5
+    importance: ImportanceField,
+    sensing: Sensing,
+    states: Mapping[int, DroneState],
+    drone: int,
+    planner: PlannerName = "coverage",
+    count: int = 5,
 ) -> Explanation:
-    """Of ``drone``, which is among ``states``, the newest of every live drone; at most ``count`` places."""
+    """Of ``drone``, which is among ``states``, the newest of every live drone; at most ``count`` places.
+
+    What does not move the ``planner`` is left out: nothing of phi pulls a lawnmower.
+    """
     team = sorted(states)
     poses = np.array([states[number].pose for number in team])
     cells = attraction(importance.field, importance.phi, sensing, poses, team.index(drone))
+    cells = replace(cells, gradients=np.where(FREE_AXES[planner], cells.gradients, 0.0))
     sums = sensing.decay_per_s * cells.gradients.sum(axis=0)
     pulls, opposed = _pulls(cells, importance.phi, sensing.decay_per_s, count)
     state = states[drone]
@@ -72,7 +90,12 @@ def explain(
         pulls=pulls,
         opposed=opposed,
         xi1=(x, y, z, yaw, pitch),
-        lines=(_motion(state), *_attraction_in_words(state, pulls, opposed), *_control_in_words(state)),
+        lines=(
+            _motion(state),
+            *_planner_in_words(state, planner),
+            *(_attraction_in_words(state, pulls, opposed) if any(FREE_AXES[planner]) else ()),
+            *_control_in_words(state),
+        ),
     )
 
 
@@ -128,6 +151,13 @@ def _motion(state: DroneState) -> str:
     if abs(pitch_rate) >= STILL_RADPS:
         parts.append(f"tilts its camera {'down' if pitch_rate > 0 else 'up'} {abs(pitch_rate):.2f} rad/s")
     return f"{state.mode}: " + (", ".join(parts) if parts else "stands still")
+
+
+def _planner_in_words(state: DroneState, planner: PlannerName) -> Iterator[str]:
+    if planner != "coverage":
+        yield f"planner {planner.replace('_', ' ')}: {OTHERS[planner]}"
+        if state.mode not in STEERED and not any(FREE_AXES[planner]):
+            yield f"{state.mode}: its planner does not steer it now"
 
 
 def _attraction_in_words(state: DroneState, pulls: tuple[Pull, ...], opposed: float) -> Iterator[str]:

@@ -90,7 +90,9 @@ class Page:
                 poses = np.array([state.pose for state in states.values()]).reshape(-1, 5)
                 self._scene.draw_field(importance.phi, list(states), poses)
                 if chosen in states:
-                    explanation = explain(importance, self._mission.sensing, states, chosen)
+                    explanation = explain(
+                        importance, self._mission.sensing, states, chosen, self._mission.controller.planner
+                    )
             self._scene.draw_pulls(explanation, self._situation)
         self._why_panel.draw(chosen, explanation)
         self._drone_panel.draw(self._situation.drones[chosen].keyframe)

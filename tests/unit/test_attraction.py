@@ -1,5 +1,7 @@
 """What the console says of a drone's motives against what the controller computes."""
 
+from typing import get_args
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from protocol.field import VirtualField
 from protocol.importance import ImportanceField
 from protocol.messages import Control, DroneState, Mode, ReplicaState
 from protocol.mission import Sensing, Target
+from protocol.planner_settings import FREE_AXES, PlannerName
 
 SENSING = Sensing()
 REPLICA = ReplicaState(tick=0, epoch=1, next_jump=0, missing=0, repaired=0, lost=0)
@@ -85,8 +88,14 @@ def test_a_tie_is_the_lower_ids_alone() -> None:
     assert len(second.rows) == 0
 
 
-def told(importance: ImportanceField, states: dict[int, DroneState], drone: int = 1, count: int = 5) -> Explanation:
-    return explain(importance, SENSING, states, drone, count)
+def told(
+    importance: ImportanceField,
+    states: dict[int, DroneState],
+    drone: int = 1,
+    count: int = 5,
+    planner: PlannerName = "coverage",
+) -> Explanation:
+    return explain(importance, SENSING, states, drone, planner, count)
 
 
 def test_the_only_important_place_is_named_with_all_of_the_pull() -> None:
@@ -154,3 +163,25 @@ def test_a_solver_that_failed_is_named() -> None:
     late = CONTROL.model_copy(update={"outcome": "out_of_time"})
     lines = told(field(), {1: state(1, team(1, 1)[0], mode="braking", control=late)}).lines
     assert "solver: out of time, so it brakes" in lines
+
+
+@pytest.mark.parametrize("planner", [planner for planner in get_args(PlannerName) if planner != "coverage"])
+def test_another_planner_is_named_and_nothing_is_told_that_does_not_move_it(planner: PlannerName) -> None:
+    importance, states = field(), {1: state(1, team(1, 5)[0])}
+    papers, found = told(importance, states), told(importance, states, planner=planner)
+
+    assert found.lines[1].startswith(f"planner {planner.replace('_', ' ')}: ")
+    free = np.array(FREE_AXES[planner])
+    np.testing.assert_array_equal(found.xi1, np.where(free, papers.xi1, 0.0))
+    assert bool(found.pulls) == free.any()
+    assert all(pull.vector[2] == 0 for pull in found.pulls), "nobody feels a pull along z at one height"
+    assert any("of the pull" in line for line in found.lines) == free.any()
+
+
+def test_the_papers_controller_needs_no_introduction() -> None:
+    assert not any(line.startswith("planner") for line in told(field(), {1: state(1, team(1, 5)[0])}).lines)
+
+
+def test_a_lawnmower_that_holds_is_said_not_to_be_steered_by_its_planner() -> None:
+    lines = told(field(), {1: state(1, team(1, 1)[0], mode="holding")}, planner="lawnmower").lines
+    assert "holding: its planner does not steer it now" in lines
