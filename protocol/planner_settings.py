@@ -11,7 +11,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import Field
 
-from protocol.settings import Metres, NonNegative, Settings
+from protocol.settings import Metres, NonNegative, Positive, Settings
 
 PlannerName = Literal["coverage", "lawnmower", "persistent", "angle_aware_down", "angle_aware"]
 
@@ -43,6 +43,10 @@ class Planners(Settings):
     regrowth_per_s: NonNegative = 0.01
     """Persistent: rate at which importance returns to 1 where nobody looks. The paper does not state it; in 1/rate one
     drone sweeps the default field once."""
+    persistent_rate_per_s: Positive = 0.3
+    """Persistent: gamma of its own certificate, the wished mean decay of a drone's own cells. The paper does not state
+    it. So much that nobody ever meets it and all fly as fast as they may, as with the paper's gamma on phi; on the
+    planar field that gamma would be met by hovering."""
 
 
 def planner_faults(

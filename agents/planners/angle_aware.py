@@ -36,7 +36,7 @@ class AngleAware(FilteredPlanner):
     def decide(
         self, pose: Floats, velocity: Floats, neighbours: Sequence[Neighbour], terms: SamplingTerms, cells: float
     ) -> Decision:
-        xi1, xi2 = sampling_row(self._mission, terms, cells)
+        xi1, xi2 = sampling_row(self._mission, terms, cells * self._mission.controller.coverage_rate_per_s)
         return self._filter.solve(
             pose,
             velocity,

@@ -25,5 +25,5 @@ class AngleAwareDown(DownwardPlanner):
     def decide(
         self, pose: Floats, velocity: Floats, neighbours: Sequence[Neighbour], terms: SamplingTerms, cells: float
     ) -> Decision:
-        xi1, xi2 = sampling_row(self._mission, terms, cells)
+        xi1, xi2 = sampling_row(self._mission, terms, cells * self._mission.controller.coverage_rate_per_s)
         return self._pursue(pose, velocity, neighbours, xi1, xi2, self._mission.sensing.decay_per_s * terms.first)

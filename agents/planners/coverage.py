@@ -22,16 +22,16 @@ class CoverageController(FilteredPlanner):
     def decide(
         self, pose: Floats, velocity: Floats, neighbours: Sequence[Neighbour], terms: SamplingTerms, cells: float
     ) -> Decision:
-        xi1, xi2 = sampling_row(self._mission, terms, cells)
+        xi1, xi2 = sampling_row(self._mission, terms, cells * self._mission.controller.coverage_rate_per_s)
         sampling = self._mission.sensing.decay_per_s * terms.first
         return self._filter.solve(pose, velocity, neighbours, xi1, xi2, sampling=sampling)
 
 
-def sampling_row(mission: Mission, terms: SamplingTerms, cells: float) -> tuple[Floats, float]:
+def sampling_row(mission: Mission, terms: SamplingTerms, wished: float) -> tuple[Floats, float]:
     """xi1 (5,) and xi2 of eqs. (15a) and (15b): keep b = I_i - |V_i| gamma from falling below zero, up to the slack.
 
-    ``cells`` = |V_i|.
+    ``wished`` = |V_i| gamma, 1/s.
     """
     settings, decay = mission.controller, mission.sensing.decay_per_s
-    xi2 = settings.sampling_gain_per_s * (decay * terms.first - cells * settings.coverage_rate_per_s)
+    xi2 = settings.sampling_gain_per_s * (decay * terms.first - wished)
     return decay * terms.gradient, xi2 - decay * decay * terms.second

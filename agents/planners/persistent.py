@@ -72,8 +72,9 @@ class PersistentCoverage(DownwardPlanner):
         drones = sorted(team)
         poses, row = np.array([team[drone] for drone in drones]), drones.index(self._drone)
         own, sensed = self._field.terms(poses, row), self._unseen.terms(poses, row)
-        xi1, xi2 = sampling_row(self._mission, own, float(self._field.owned_cells(poses)[row]))
-        growth = self._mission.planners.regrowth_per_s * (sensed.first - own.first)
+        settings, cells = self._mission.planners, float(self._field.owned_cells(poses)[row])
+        xi1, xi2 = sampling_row(self._mission, own, cells * settings.persistent_rate_per_s)
+        growth = settings.regrowth_per_s * (sensed.first - own.first)
         return xi1, xi2 + self._mission.sensing.decay_per_s * growth
 
 

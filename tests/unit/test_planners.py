@@ -163,7 +163,7 @@ def test_the_certificate_s_row_is_its_barrier_condition_with_the_growth() -> Non
 
     step = 1e-4
     rate = (share(step) - share(-step)) / (2 * step)
-    barrier = share(0.0) - own.field.size * settings.controller.coverage_rate_per_s
+    barrier = share(0.0) - own.field.size * settings.planners.persistent_rate_per_s
     expected = rate + settings.controller.sampling_gain_per_s * barrier
     assert float(xi1 @ velocity) + xi2 == pytest.approx(expected, rel=1e-3, abs=1e-3 * np.abs(xi1).sum())
 
