@@ -38,7 +38,6 @@ class PersistentCoverage(DownwardPlanner):
         self._drone = drone
         self._field = _planar_field(mission)
         self._unseen = _planar_field(mission)  # stays 1 everywhere: its terms are sums of h1 alone
-        self._everywhere = np.arange(self._field.phi.shape[0])
         self._kept = math.exp(-mission.planners.regrowth_per_s * mission.tick_s)
         self._team: dict[int, Floats] = {}
 
@@ -53,7 +52,7 @@ class PersistentCoverage(DownwardPlanner):
         self._team = dict(zip(drones, poses, strict=True))
         self._field.advance(poses, self._mission.tick_s)
         grown = 1 - self._kept * (1 - self._field.phi)
-        self._field.overwrite(self._everywhere, grown.astype(np.float32))
+        self._field.overwrite(0, grown.astype(np.float32))
 
     def decide(
         self,

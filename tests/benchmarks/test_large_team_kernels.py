@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from agents.barriers import Neighbour
-from agents.coverage import CoverageController
+from agents.planners.coverage import CoverageController
 from protocol.aggregator import Gatherer
 from protocol.field import VirtualField
 from protocol.formation import formation
