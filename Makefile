@@ -26,8 +26,10 @@ check: $(TESTABLE) ## formatting, lint, types, layers, dependencies: what CI che
 	@$(BIN)/lint-imports --no-cache
 	@$(BIN)/deptry .
 
-bench: $(TESTABLE) ## the benchmarks, one after another
+bench: $(TESTABLE) ## the benchmarks, one after another; writes benchmarks.json and docs/benchmarks.md
+	@rm -f benchmarks.json
 	@$(ONE_THREAD) $(BIN)/python -m pytest tests/benchmarks
+	@PYTHONPATH=.:tests $(BIN)/python -m faults.benchmarks_page
 
 # Faults on real processes, one flight after another, and on a simulated network: about an hour.
 faults: $(TESTABLE) ## what the system survives: every fault, random schedules; writes docs/reliability.md
