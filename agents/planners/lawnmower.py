@@ -46,7 +46,7 @@ class Lawnmower(FilteredPlanner):
         area = Rectangle(target.lower_m[:2], target.upper_m[:2])
         self._sector = divide(area, {other.id: other.start[:2] for other in mission.drones})[drone]
         seen = footprint_of(mission.camera, mission.sensing.distance_m)
-        self._footprint = Footprint(seen.width_m - 2 * ARRIVED_M, seen.length_m - 2 * ARRIVED_M)
+        self._footprint = Footprint(_spared(seen.width_m), _spared(seen.length_m))
         self._low, self._high = np.array(flight.lower_m[:2]), np.array(flight.upper_m[:2])
         self._along = self._sector.longer_axis
         self._way: deque[Floats] = deque()
@@ -90,8 +90,7 @@ class Lawnmower(FilteredPlanner):
 
     def _towards_next(self, pose: Floats) -> Floats:
         """Horizontal velocity (2,) towards the next waypoint, which is passed or left out where it is time to."""
-        offset = np.append(self._way[0], self._mission.planners.altitude_m) - pose[:3]
-        left_m = float(np.linalg.norm(offset))
+        left_m = math.hypot(*(self._way[0] - pose[:2]), self._mission.planners.altitude_m - pose[2])
         self._waited += 1
         if left_m < self._left_m - NEARER_M:
             self._left_m, self._waited = left_m, 0
@@ -104,9 +103,13 @@ class Lawnmower(FilteredPlanner):
                 self.passes += 1
                 self._along = 1 - self._along
                 return np.zeros(2)
-            offset = np.append(self._way[0], 0.0) - np.append(pose[:2], 0.0)
-        horizontal = offset[:2]
-        distance = float(np.linalg.norm(horizontal))
+        offset = self._way[0] - pose[:2]
+        distance = float(np.linalg.norm(offset))
         speed = min(self._mission.flight.speed_max_mps, CLOSING_PER_S * distance)
-        towards: Floats = horizontal * (speed / max(distance, 1e-9))
+        towards: Floats = offset * (speed / max(distance, 1e-9))
         return towards
+
+
+def _spared(side_m: float) -> float:
+    """A side of the footprint that is seen also where a waypoint is passed at a distance; half of it if it is tiny."""
+    return max(side_m - 2 * ARRIVED_M, side_m / 2)

@@ -253,3 +253,14 @@ def test_somebody_who_stands_still_in_the_way_is_flown_around() -> None:
         nearest = min(nearest, math.dist(pose[:3], ahead.position))
     assert nearest >= 1.0
     assert pose[0] > ahead.position[0] + 0.5
+
+
+def test_a_camera_that_sees_next_to_nothing_still_has_a_way_to_sweep() -> None:
+    planner = Lawnmower(
+        mission("lawnmower", sensing={"distance_m": 0.05}, target={"lower_m": (0, 0, 0), "upper_m": (1, 1, 2)}),
+        drone=1,
+        neighbours=0,
+    )
+    planner.decide(READY, STILL, [], TERMS, CELLS)
+
+    assert 20 < len(planner._way) < 400
