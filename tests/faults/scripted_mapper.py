@@ -33,6 +33,8 @@ class ScriptedMapper:
         self._seed = seed
         self._updates = 0
         self.taken = self.refused = 0
+        self.feedback_update_s = None
+        """Nothing is compared here."""
 
     def add(self, keyframes: Sequence[messages.Keyframe]) -> None:
         """Images say nothing here."""
