@@ -16,6 +16,8 @@ from ground_station.reconstruction.semi_global import SemiGlobal
 from ground_station.reconstruction.views import View
 from protocol.mission import Reconstruction
 
+BEYOND: Final = 4.0
+"""The plane beyond the farthest depth is at most so many times as far: inverse depths stay positive with few planes."""
 SCORE_MIN: Final = 0.35
 """Correlation under which a depth is not believed."""
 
@@ -42,7 +44,7 @@ class DepthEstimator:
         settings = self._settings
         nearest = max(span.nearest, settings.nearest_m)
         farthest = max(min(span.farthest, settings.farthest_m), nearest * 1.01)
-        inverse_depths = np.linspace(1 / farthest, 1 / nearest, settings.depth_planes, dtype=np.float32)
+        inverse_depths = planes(nearest, farthest, settings.depth_planes)
         sweep, aggregation = self._tools()
         disparity = aggregation.aggregate(sweep.costs(view, sources, inverse_depths), view.grey)
         step = (inverse_depths[-1] - inverse_depths[0]) / (settings.depth_planes - 1)
@@ -58,3 +60,14 @@ class DepthEstimator:
             )
         tools: tuple[PlaneSweep, SemiGlobal] = self._thread.tools
         return tools
+
+
+def planes(nearest_m: float, farthest_m: float, count: int) -> NDArray[np.float32]:
+    """(count,) inverse depths, 1/m, ascending and evenly spaced: from one plane beyond ``farthest_m`` to ``nearest_m``.
+
+    Depths at the outermost planes are not believed, because the true ones may lie beyond. Without the plane beyond, a
+    floor that is seen from straight above, the farthest that there is in the whole image, would never be mapped.
+    """
+    step = (1 / nearest_m - 1 / farthest_m) / (count - 2)
+    first = max(1 / farthest_m - step, 1 / (BEYOND * farthest_m))
+    return np.linspace(first, 1 / nearest_m, count, dtype=np.float32)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ground_station.reconstruction.consistency import agreements
-from ground_station.reconstruction.depth_map import DepthEstimator
+from ground_station.reconstruction.depth_map import DepthEstimator, planes
 from ground_station.reconstruction.depth_range import DepthRange, depth_range
 from ground_station.reconstruction.plane_sweep import COST_MAX, RADIUS, PlaneSweep, plane_homography
 from ground_station.reconstruction.views import View
@@ -130,3 +130,15 @@ def test_the_depth_range_spans_the_box_and_nothing_else() -> None:
     assert span.farthest == pytest.approx(2.05)
     up = View(down.grey, down.position, camera_rotation(0.0, -np.pi / 2), CAMERA)
     assert depth_range(up, box, margin_m=0.05) is None
+
+
+@pytest.mark.parametrize("count", [16, 48, 256])
+def test_the_farthest_depth_has_a_plane_beyond_it_and_all_are_evenly_spaced(count: int) -> None:
+    inverse = planes(0.35, 2.05, count)
+    steps = np.diff(inverse)
+
+    assert inverse.shape == (count,)
+    assert min(inverse[0], planes(0.35, 4.2, 8)[0]) > 0
+    assert inverse[1] <= 1 / 2.05 + 1e-5
+    assert inverse[-1] == pytest.approx(1 / 0.35)
+    np.testing.assert_allclose(steps, steps[0], rtol=1e-3)
