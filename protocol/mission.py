@@ -191,8 +191,10 @@ class Feedback(Settings):
     """Time between two meshes that are compared."""
     delay_s: NonNegative = 1.0
     """Age at which a jump takes effect, the same in every process: time to compute and to travel; at most a period."""
-    kappa: Positive = 0.7
-    """Vertex-count change that counts, eq. (5); for "grid" alone."""
+    kappa: Positive = 4.0
+    """Change in the number of vertices around a point that counts, eq. (5); for "grid" alone. A plane has
+    (spacing_m / voxel_m)^2 = 16 there, of which one to three come and go with every view. At the printed 0.7, for a
+    grid and a density that are not stated, one counts as much as new surface, and J does not settle (docs/adr/0017)."""
     cylinder: Cylinder = Cylinder()
     """For "m3c2" alone."""
     kernel_m: Positive = 0.4

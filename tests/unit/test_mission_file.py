@@ -258,7 +258,7 @@ def test_the_committed_schema_is_current() -> None:
     committed = (ROOT / "protocol" / "mission.schema.json").read_text()
 
     assert committed == mission_schema(), "covrecon mission schema > protocol/mission.schema.json"
-    assert math.isclose(json.loads(committed)["$defs"]["Feedback"]["properties"]["kappa"]["default"], 0.7)
+    assert math.isclose(json.loads(committed)["$defs"]["Feedback"]["properties"]["kappa"]["default"], 4.0)
 
 
 @pytest.mark.parametrize(
