@@ -13,6 +13,7 @@ import pytest
 from deploy.bench.campaign import left_of
 from deploy.bench.flight import keep
 from deploy.bench.plan import (
+    ALL_METHODS,
     METHODS,
     Job,
     Wish,
@@ -54,6 +55,14 @@ def test_each_method_flies_alone_and_grid_feedback_also_in_teams_and_with_other_
         ("grid", 1, 0.3): 3,
         ("grid", 1, 0.7): 3,
     }
+
+
+def test_the_whole_table_has_every_method_and_all_of_its_missions_hold() -> None:
+    jobs = paper_jobs(wish(seeds=1), ALL_METHODS)
+    single = [job for job in jobs if (job.planned.drones, job.planned.threshold) == (1, 0.5)]
+    assert [job.planned.method for job in single] == list(get_args(Method))
+    assert [(job.mission.controller.planner, job.mission.feedback.method) for job in single] == list(METHODS.values())
+    assert len(jobs) == len({job.planned.folder for job in jobs}) == len(METHODS) + 4
 
 
 def test_a_flight_that_is_wished_for_twice_is_planned_once() -> None:
