@@ -21,7 +21,8 @@ from ground_station.mesh_change_choice import make_mesh_change
 from ground_station.reconstruction.backends import make_reconstructor
 from ground_station.reconstruction.reconstructor import Keyframe, Mesh, State
 from protocol import messages
-from protocol.errors import ReconstructionError
+from protocol.depth_image import decode_depth
+from protocol.errors import MessageError, ReconstructionError
 from protocol.field import VirtualField
 from protocol.geometry import Intrinsics
 from protocol.keyframe_rule import KeyframeRule
@@ -86,7 +87,7 @@ class Mapper:
         """The keyframe in ``message``; None if it cannot be read, or the camera hardly moved since the last."""
         try:
             keyframe = _decode(message)
-        except (ReconstructionError, UnidentifiedImageError, OSError, ValueError) as error:
+        except (ReconstructionError, MessageError, UnidentifiedImageError, OSError, ValueError) as error:
             self._unreadable += 1
             log.warning("drone %d: keyframe %d refused: %s", message.drone, message.sequence, error)
             return None
@@ -185,4 +186,5 @@ def _decode(message: messages.Keyframe) -> Keyframe:
         position=np.array(message.position),
         rotation=np.array(message.rotation),
         intrinsics=Intrinsics(message.width, message.height, message.fx, message.fy, message.cx, message.cy),
+        depth=decode_depth(message.depth, message.width, message.height) if message.depth else None,
     )

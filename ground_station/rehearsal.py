@@ -20,6 +20,9 @@ IMAGES = 12
 """Enough for the first ones to be compared, confirmed and fused."""
 TICKS_APART = 10
 PATCH_PX = 8
+DEPTH_PX = (36, 64)
+DRIFT_M = 1e-4
+"""By which each depth image differs from the one before: two alike would be a frozen camera's."""
 
 
 def rehearse(mission: Mission) -> int:
@@ -52,6 +55,7 @@ def rehearse(mission: Mission) -> int:
                     position=centre + rotation[:, 0] * step_m * (k - IMAGES / 2),
                     rotation=rotation,
                     intrinsics=intrinsics,
+                    depth=np.full(DEPTH_PX, HEIGHT_M + k * DRIFT_M, np.float32),
                 )
             ]
         )

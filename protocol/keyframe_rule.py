@@ -31,7 +31,14 @@ class KeyframeRule:
 
 
 def make_keyframe(
-    drone: int, sequence: int, tick: int, position: Floats, rotation: Floats, intrinsics: Intrinsics, jpeg: bytes
+    drone: int,
+    sequence: int,
+    tick: int,
+    position: Floats,
+    rotation: Floats,
+    intrinsics: Intrinsics,
+    jpeg: bytes,
+    depth: bytes = b"",
 ) -> Keyframe:
     """``position`` (3,) and ``rotation`` (3, 3), camera to world, are those of the camera."""
     x_row, y_row, z_row = rotation.tolist()
@@ -48,4 +55,5 @@ def make_keyframe(
         cx=intrinsics.cx,
         cy=intrinsics.cy,
         jpeg=jpeg,
+        depth=depth,
     )

@@ -185,6 +185,8 @@ class Keyframe(Message):
     cx: Finite
     cy: Finite
     jpeg: bytes
+    depth: bytes = b""
+    """What a depth camera measured through the same lens (`protocol.depth_image`); empty without one."""
 
 
 class Jump(Message):

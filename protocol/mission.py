@@ -225,6 +225,9 @@ class Camera(Settings):
     jpeg_quality: Annotated[int, Field(ge=30, le=100)] = 90
     latency_s: NonNegative = 0.0
     """Of a real camera: from exposure until its frame is read here; images are posed at arrival less this."""
+    depth: bool = False
+    """Whether it measures depth as well, which its keyframes then carry; with reconstruction.backend "depth" it always
+    does. For now, only simulated cameras can."""
 
     def intrinsics(self) -> Intrinsics:
         return Intrinsics.from_field_of_view(self.width_px, self.height_px, self.horizontal_fov_rad)
@@ -233,9 +236,10 @@ class Camera(Settings):
 class Reconstruction(Settings):
     """Images to mesh; docs/adr/0004 has the measurements behind it."""
 
-    backend: Literal["plane_sweep", "none"] = "plane_sweep"
+    backend: Literal["plane_sweep", "depth", "none"] = "plane_sweep"
+    """"plane_sweep": depth from images; "depth": that of depth cameras."""
     sweep_width_px: Annotated[int, Field(ge=32, le=1024)] = 128
-    """Width at which depth is computed; the height follows from the camera."""
+    """Width at which depth is computed, or measured by a depth camera; the height follows from the camera."""
     depth_planes: Annotated[int, Field(ge=8, le=256)] = 48
     nearest_m: Positive = 0.35
     farthest_m: Positive = 4.2
@@ -253,6 +257,10 @@ class Simulation(Settings):
     to the mission file; empty for a flight without images."""
     image_noise: NonNegative = 2.0
     """Standard deviation of the camera's noise, in grey levels of 255."""
+    depth_noise_m: NonNegative = 0.002
+    """Of a depth camera: standard deviation of a depth close by, ..."""
+    depth_noise_per_m: NonNegative = 0.003
+    """... and what is added to it for each square metre of the depth's square, 1/m: stereo and structured light."""
     start_patience_s: Positive = 120.0
     """How long the first tick waits for all drones; one that comes later joins in flight."""
 
@@ -329,6 +337,16 @@ class Mission(Settings):
     def tick_s(self) -> float:
         return 1.0 / self.controller.rate_hz
 
+    @property
+    def measures_depth(self) -> bool:
+        """Whether keyframes carry depth."""
+        return self.camera.depth or self.reconstruction.backend == "depth"
+
+    def sweep_intrinsics(self) -> Intrinsics:
+        """Of depth images, computed and measured."""
+        width = self.reconstruction.sweep_width_px
+        return self.camera.intrinsics().scaled_to(width, round(width * self.camera.height_px / self.camera.width_px))
+
     def drone(self, number: int) -> Drone:
         """The drone with this id. Raises `StopIteration` when there is none."""
         return next(drone for drone in self.drones if drone.id == number)
@@ -378,6 +396,12 @@ class Mission(Settings):
         else:
             faults += [
                 f'drones.{index}.camera: a real camera needs a real vehicle, vehicles.kind = "px4"'
+                for index, drone in enumerate(self.drones)
+                if drone.camera
+            ]
+        if self.measures_depth:
+            faults += [
+                f"drones.{index}.camera: gives no depth, which camera.depth or reconstruction.backend asks for"
                 for index, drone in enumerate(self.drones)
                 if drone.camera
             ]

@@ -85,7 +85,7 @@ STATE = Topic("drone/{drone}/state", messages.DroneState, ("agent",), ("agent", 
 TEAM = Topic("team/states", messages.TeamStates, ("router",), ("agent",),
              "INTERACTIVE_HIGH", 16, 0.4, False, 256 * _KIB)
 KEYFRAME = Topic("drone/{drone}/keyframe", messages.Keyframe, ("agent", "sim"), ("ground", "operator"),
-                 "DATA_LOW", 256, _NO_AGE, True, 8 * _MIB)
+                 "DATA_LOW", 256, _NO_AGE, True, 12 * _MIB)
 SETPOINT = Topic("drone/{drone}/setpoint", messages.Setpoint, ("agent",), ("sim",),
                  "REAL_TIME", 256, 0.5, True, 1 * _KIB, express=True)
 TICK = Topic("clock/tick", messages.Tick, ("sim",), ("agent", "ground", "operator", "router"),

@@ -105,7 +105,7 @@ def setpoint(drone: int) -> Setpoint:
     return Setpoint(drone=drone, tick=TICK, velocity=pose(drone, TICK + 1))
 
 
-def keyframe(mission: Mission, drone: int, jpeg_bytes: int) -> Keyframe:
+def keyframe(mission: Mission, drone: int, jpeg_bytes: int, depth_bytes: int = 0) -> Keyframe:
     camera = mission.camera.intrinsics()
     x, y, z, _, _ = pose(drone, TICK)
     return Keyframe(
@@ -121,6 +121,7 @@ def keyframe(mission: Mission, drone: int, jpeg_bytes: int) -> Keyframe:
         cx=camera.cx,
         cy=camera.cy,
         jpeg=bytes(jpeg_bytes),
+        depth=bytes(depth_bytes),
     )
 
 

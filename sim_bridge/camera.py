@@ -95,6 +95,17 @@ def add_noise(image: NDArray[np.uint8], sigma: float, rng: np.random.Generator) 
     return noisy
 
 
+def add_depth_noise(
+    depth: NDArray[np.float32], near_m: float, per_m: float, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """``depth`` (H, W) m with independent normal noise of standard deviation ``near_m + per_m * depth ** 2``."""
+    if near_m <= 0 and per_m <= 0:
+        return depth
+    draws = rng.integers(0, 1 << _NOISE_BITS, depth.shape)
+    noise = _normal_quantiles().astype(np.float32)[draws] * (near_m + per_m * depth * depth)
+    return np.where(np.isfinite(depth), depth + noise, depth).astype(np.float32)
+
+
 @cache
 def _normal_quantiles() -> NDArray[np.float64]:
     count = 1 << _NOISE_BITS

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image
 
+from protocol.depth_image import encode_depth
 from protocol.geometry import Floats, camera_rotation
 from protocol.keyframe_rule import KeyframeRule, make_keyframe
 from protocol.messages import Keyframe
 from protocol.mission import Mission
-from sim_bridge.camera import Camera, add_noise
+from sim_bridge.camera import Camera, add_depth_noise, add_noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,8 +28,9 @@ class Shot:
 
 
 class Photographer:
-    def __init__(self, mission: Mission, camera: Camera) -> None:
-        self._mission, self._camera = mission, camera
+    def __init__(self, mission: Mission, camera: Camera, depth_camera: Camera | None = None) -> None:
+        """``depth_camera``: of the mission's `sweep_intrinsics`; None: keyframes carry no depth."""
+        self._mission, self._camera, self._depth_camera = mission, camera, depth_camera
         self._intrinsics = mission.camera.intrinsics()
         self._rules = {drone.id: KeyframeRule(mission.camera) for drone in mission.drones}
         self._taken = dict.fromkeys(self._rules, 0)
@@ -46,8 +48,8 @@ class Photographer:
         """Render one; the noise depends on the mission's seed, the drone and the sequence number alone."""
         settings = self._mission.camera
         image = self._camera.render(shot.pose.tolist())
+        generator = np.random.default_rng([self._mission.seed, shot.drone, shot.sequence])
         if self._mission.simulation.image_noise > 0:
-            generator = np.random.default_rng([self._mission.seed, shot.drone, shot.sequence])
             image = add_noise(image, self._mission.simulation.image_noise, generator)
         jpeg = io.BytesIO()
         Image.fromarray(image).save(jpeg, "JPEG", quality=settings.jpeg_quality)
@@ -60,4 +62,13 @@ class Photographer:
             camera_rotation(pose[3], pose[4]),
             self._intrinsics,
             jpeg.getvalue(),
+            self._measure(shot, generator),
         )
+
+    def _measure(self, shot: Shot, generator: np.random.Generator) -> bytes:
+        """What a depth camera there gives; empty without one."""
+        if self._depth_camera is None:
+            return b""
+        settings = self._mission.simulation
+        depth = self._depth_camera.render_depth(shot.pose.tolist())
+        return encode_depth(add_depth_noise(depth, settings.depth_noise_m, settings.depth_noise_per_m, generator))

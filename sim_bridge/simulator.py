@@ -199,4 +199,5 @@ def _make_photographer(mission: Mission, run: Path) -> Photographer | None:
     write_truth(scene, mission, run, cache=cache)
     camera = Camera(scene, mission.camera.intrinsics())
     camera.render(mission.drones[0].start)
-    return Photographer(mission, camera)
+    depth_camera = Camera(scene, mission.sweep_intrinsics()) if mission.measures_depth else None
+    return Photographer(mission, camera, depth_camera)

@@ -6,6 +6,7 @@ therefore reports two kinds of outcome, of the keyframes just given and of earli
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal, Protocol, TypeAlias
@@ -19,10 +20,13 @@ from protocol.geometry import Floats, Intrinsics
 ROTATION_TOLERANCE: Final = 1e-4
 """Largest error of an entry of R R^T: float32 on the wire leaves 1e-6."""
 
-Refusal: TypeAlias = Literal["repeated", "featureless", "blurred", "off_target", "no_overlap", "no_depth"]
+Refusal: TypeAlias = Literal[
+    "repeated", "featureless", "blurred", "off_target", "no_overlap", "no_depth", "wrong_scale"
+]
 """``repeated``: not newer than the drone's last, or the same image again (a frozen camera would ruin the map).
 ``featureless``: black, white or covered. ``off_target``: looks past the box to be mapped. ``no_overlap``: no other
-keyframe shows the same place from a useful angle. ``no_depth``: compared, but no depth that two views agree on."""
+keyframe shows the same place from a useful angle. ``no_depth``: compared, but no depth that two views agree on.
+``wrong_scale``: its depths are all the same multiple of what others measured."""
 
 State: TypeAlias = Mapping[str, NDArray[Any]]
 """What a reconstructor has to know again after a restart, beside its newest keyframes: arrays of its own choice."""
@@ -45,6 +49,8 @@ class Keyframe:
     """(3, 3), camera to world (`protocol.geometry`)."""
     intrinsics: Intrinsics
     """Of ``image``."""
+    depth: NDArray[np.float32] | None = None
+    """(h, w) m along the optical axis, 0 where unknown, as a depth camera measured it through the same lens."""
 
     def __post_init__(self) -> None:
         name = f"keyframe {self.sequence} of drone {self.drone}"
@@ -58,6 +64,17 @@ class Keyframe:
         skew = np.abs(self.rotation @ self.rotation.T - np.eye(3)).max()
         if skew > ROTATION_TOLERANCE or np.linalg.det(self.rotation) < 0:
             raise ReconstructionError(f"{name}: rotation is not a right-handed orthonormal matrix")
+        if self.depth is not None:
+            self._check_depth(name, self.depth)
+
+    def _check_depth(self, name: str, depth: NDArray[np.float32]) -> None:
+        if depth.dtype != np.float32 or depth.ndim != 2 or 0 in depth.shape:
+            raise ReconstructionError(f"{name}: depth is {depth.dtype} {depth.shape}, expected float32 (h, w)")
+        height, width = depth.shape
+        if not math.isclose(height, width * self.intrinsics.height / self.intrinsics.width, abs_tol=1.0):
+            raise ReconstructionError(f"{name}: depth has {width} x {height} pixels, which is not the image's shape")
+        if not np.isfinite(depth).all() or depth.min() < 0:
+            raise ReconstructionError(f"{name}: depth is not finite, or negative")
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,7 @@ from pydantic_core import to_json
 from ground_station.recording import shapes
 from ground_station.recording.file import ChunkWriter
 from ground_station.recording.stored import (
+    IMAGES,
     StoredHandOver,
     StoredJump,
     StoredKeyframe,
@@ -40,6 +41,7 @@ Kind: TypeAlias = Literal[
 MISSION: Final = "/mission"
 STATE: Final = "/drone/{drone}/state"
 CAMERA: Final = "/drone/{drone}/camera"
+DEPTH: Final = "/drone/{drone}/depth"
 KEYFRAME: Final = "/drone/{drone}/keyframe"
 EVENT: Final = "/event"
 HAND_OVER: Final = "/ground/hand_over"
@@ -60,7 +62,7 @@ _STATUS: Final = "/ground/status"
 CHANNELS: Final[Mapping[Kind, tuple[str, ...]]] = {
     "mission": (MISSION,),
     "state": (_TRANSFORMS, _POSE, STATE),
-    "keyframe": (_CALIBRATION, CAMERA, KEYFRAME),
+    "keyframe": (_CALIBRATION, CAMERA, DEPTH, KEYFRAME),
     "event": (_LOG, EVENT),
     "phase": (_PHASE,),
     "status": (_STATUS,),
@@ -73,13 +75,14 @@ CHANNELS: Final[Mapping[Kind, tuple[str, ...]]] = {
     "metrics": (METRICS,),
     "summary": (SUMMARY,),
 }
-"""A camera's image comes right before the keyframe that it belongs to; the reader joins the two."""
+"""A camera's image and its depth, if it has any, come right before their keyframe; the reader joins them."""
 
 _FOR_PLAYERS: Final[Mapping[str, Any]] = {
     _TRANSFORMS: players.FrameTransforms,
     _POSE: players.PoseInFrame,
     _CALIBRATION: players.CameraCalibration,
     CAMERA: players.CompressedImage,
+    DEPTH: players.CompressedImage,
     _LOG: players.Log,
     PHI: players.PointCloud,
     MESH: players.SceneUpdate,
@@ -168,7 +171,9 @@ class Channels:
             case "keyframe":
                 self._show(_CALIBRATION, shapes.calibration(content, time_ns), time_ns, content.drone)
                 self._show(CAMERA, shapes.image(content, time_ns), time_ns, content.drone)
-                self._log(KEYFRAME, content.model_dump_json(exclude={"jpeg"}).encode(), time_ns, content.drone)
+                if content.depth:
+                    self._show(DEPTH, shapes.depth(content, time_ns), time_ns, content.drone)
+                self._log(KEYFRAME, content.model_dump_json(exclude=IMAGES).encode(), time_ns, content.drone)
             case "event":
                 self._show(_LOG, shapes.log_line(content, time_ns), time_ns)
                 self._store(EVENT, content, time_ns)

@@ -70,7 +70,7 @@ class Recording:
         self._tick_ns = self.mission.tick_s * 1e9
         self._drones = {
             channel.format(drone=drone.id): drone.id
-            for channel in (channels.CAMERA, channels.KEYFRAME)
+            for channel in (channels.CAMERA, channels.DEPTH, channels.KEYFRAME)
             for drone in self.mission.drones
         }
 
@@ -148,20 +148,22 @@ class Recording:
 
     def _joined(self, topics: Sequence[str]) -> Iterator[_Found | messages.Keyframe]:
         """Messages, but for keyframes and their images, which are put together."""
-        images: dict[int, tuple[int, bytes]] = {}
+        images: dict[str, tuple[int, bytes]] = {}
         for found in self._messages(topics):
             drone = self._drones.get(found.topic)
             if drone is None:
                 yield found
-            elif found.topic == channels.CAMERA.format(drone=drone):
-                images[drone] = found.time_ns, self._decoded(found).data
+            elif found.topic != channels.KEYFRAME.format(drone=drone):
+                images[found.topic] = found.time_ns, self._decoded(found).data
             else:
-                time_ns, jpeg = images.pop(drone, (-1, b""))
+                time_ns, jpeg = images.pop(channels.CAMERA.format(drone=drone), (-1, b""))
                 if time_ns != found.time_ns:
                     continue  # its image is in a chunk that is lost
+                time_ns, depth = images.pop(channels.DEPTH.format(drone=drone), (-1, b""))
                 with self._reading():
                     keyframe = StoredKeyframe.model_validate_json(found.data)
-                    joined = messages.Keyframe(**vars(keyframe), jpeg=jpeg)
+                    measured = depth if time_ns == found.time_ns else b""
+                    joined = messages.Keyframe(**vars(keyframe), jpeg=jpeg, depth=measured)
                 yield joined
 
     # --- what there is to show -----------------------------------------------------------------------------------

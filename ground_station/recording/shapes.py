@@ -109,6 +109,12 @@ def image(keyframe: messages.Keyframe, time_ns: int) -> CompressedImage:
     )
 
 
+def depth(keyframe: messages.Keyframe, time_ns: int) -> CompressedImage:
+    return CompressedImage(
+        timestamp=stamp(time_ns), frame_id=f"camera_{keyframe.drone}", data=keyframe.depth, format="png"
+    )
+
+
 def calibration(keyframe: messages.Keyframe, time_ns: int) -> CameraCalibration:
     fx, fy, cx, cy = keyframe.fx, keyframe.fy, keyframe.cx, keyframe.cy
     return CameraCalibration(

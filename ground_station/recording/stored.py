@@ -83,11 +83,13 @@ class StoredJump(Stored):
         )
 
 
+IMAGES = frozenset({"jpeg", "depth"})
+"""Fields of a keyframe that are recorded on channels of their own, where players show them."""
 _KEYFRAME: dict[str, Any] = {
-    name: (field.annotation, field) for name, field in messages.Keyframe.model_fields.items() if name != "jpeg"
+    name: (field.annotation, field) for name, field in messages.Keyframe.model_fields.items() if name not in IMAGES
 }
 StoredKeyframe: type[Stored] = create_model("StoredKeyframe", __base__=Stored, **_KEYFRAME)
-"""A keyframe without its image, which is the message before it on the drone's camera channel."""
+"""A keyframe without its images, which are the messages before it on the drone's camera and depth channels."""
 
 
 def schema_of(model: type) -> dict[str, Any]:
