@@ -7,6 +7,7 @@ when they run, so that help and completion answer at once.
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 from pathlib import Path
 from typing import Annotated, Literal, NoReturn
@@ -85,6 +86,7 @@ def run(
     wait: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     foxglove: Annotated[int | None, Parameter(show_default=False)] = None,
     metrics: Annotated[int | None, Parameter(show_default=False)] = None,
+    mapper: Annotated[str, Parameter(show_default=False)] = "",
     out: Path = Path("runs"),
 ) -> int:
     """Fly a mission: router, simulator, ground station and one process a drone, all on this machine.
@@ -117,6 +119,8 @@ def run(
         Port at which Foxglove may watch on this computer, 8765 for example.
     metrics
         First port of the Prometheus endpoints on this computer.
+    mapper
+        Command of a process of your own that makes the map, started with the run (docs/external-reconstructor.md).
     out
         Where the run's folder is made.
     """
@@ -134,6 +138,7 @@ def run(
         "start": "on_command" if wait else None,
         "recording.foxglove_port": foxglove,
         "metrics.port": metrics,
+        "reconstruction.backend": "external" if mapper else None,
     }
     replaced = {name: value for name, value in chosen.items() if value is not None}
     checked = load_mission(mission, drones=drones, seed=seed, replaced=replaced)
@@ -152,6 +157,7 @@ def run(
         restarts=restart,
         with_autopilots=vehicles == "px4-endpoint",
         with_console=console,
+        mapper=shlex.split(mapper),
     )
 
 

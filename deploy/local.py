@@ -39,9 +39,9 @@ LOG_BYTES = 16 * 1024
 BAD_INPUT = 2
 """Exit code of a process that refuses its mission, scene or endpoint; any other failure is 1."""
 
-Kind = Literal["router", "ground", "sim", "observer", "autopilots", "agent", "console"]
+Kind = Literal["router", "ground", "sim", "observer", "autopilots", "agent", "console", "mapper"]
 """sim and autopilots carry vehicles, an observer only watches them."""
-SERVANTS: tuple[Kind, ...] = ("router", "autopilots", "console")
+SERVANTS: tuple[Kind, ...] = ("router", "autopilots", "console", "mapper")
 """Serve until the others are gone, and go with the group."""
 
 
@@ -73,23 +73,25 @@ def mission_roles(
     px4: bool = False,
     autopilots: bool = False,
     console: bool = False,
+    mapper: Sequence[str] = (),
 ) -> list[Role]:
     """Router, simulator, ground station and one agent a drone; all read ``mission.json`` in the run folder.
 
     ``px4``: the vehicles are not the simulator's. ``autopilots``: they are PX4-like ones of our own. ``console``: with
-    the page in the browser.
+    the page in the browser. ``mapper``: command of a process of the user's own that makes the map.
     """
+    told = ("--mission", str(run / "mission.json"), "--endpoint", endpoint, "--run", str(run), "--speed", speed)
 
     def role(name: str, kind: Kind, module: str, *more: str) -> Role:
         # -P keeps the folder that the launcher was called in from shadowing a package.
-        command = (sys.executable, "-P", "-m", module, "--mission", str(run / "mission.json"))
-        return Role(name, kind, (*command, "--endpoint", endpoint, "--run", str(run), "--speed", speed, *more))
+        return Role(name, kind, (sys.executable, "-P", "-m", module, *told, *more))
 
     return [
         role("router", "router", "protocol.router"),
         *([role("autopilots", "autopilots", "sim_bridge.px4_endpoint")] if autopilots else []),
         role("sim", "observer" if px4 else "sim", "sim_bridge"),
         role("ground", "ground", "ground_station"),
+        *([Role("mapper", "mapper", (*mapper, *told))] if mapper else []),
         *([role("console", "console", "ground_station.console")] if console else []),
         *(role(f"drone-{drone}", "agent", "agents", "--drone", str(drone)) for drone in drones),
     ]
@@ -174,7 +176,7 @@ class _Run:
         else:
             self._say(_obituary(role, code, self._logs))
             self._result = self._result or (BAD_INPUT if code == BAD_INPUT else 1)
-            self._hopeless |= role.kind not in ("agent", "observer", "console")
+            self._hopeless |= role.kind not in ("agent", "observer", "console", "mapper")
 
     def _may_start_again(self, role: Role, code: int) -> bool:
         mortal = role.kind not in ("sim", "autopilots") and code != BAD_INPUT and not self._over

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -38,11 +39,13 @@ def fly(
     restarts: int = 0,
     with_autopilots: bool = False,
     with_console: bool = False,
+    mapper: Sequence[str] = (),
 ) -> int:
     """Run ``mission`` on this machine and say how it went; the exit code of the command.
 
     A process that dies is started again up to ``restarts`` times, the simulator of vehicles excepted.
     ``with_autopilots``: also start PX4-like vehicles of our own. ``with_console``: and the page in the browser.
+    ``mapper``: and this command, which makes the map.
     """
     with TemporaryDirectory(prefix="covrecon-", dir=socket_folder_parent(), ignore_cleanup_errors=True) as private:
         endpoint = mission.transport.endpoint or socket_endpoint(Path(private))
@@ -55,6 +58,7 @@ def fly(
             px4=mission.vehicles.kind == "px4",
             autopilots=with_autopilots,
             console=with_console,
+            mapper=mapper,
         )
         with display:
             compile_everything(mission)

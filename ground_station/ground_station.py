@@ -16,6 +16,7 @@ from prometheus_client import CollectorRegistry
 
 from ground_station.command_log import COMMANDS_FILE, CommandLog
 from ground_station.command_service import CommandService
+from ground_station.external_map import ExternalMap
 from ground_station.ground_metrics import GroundMetrics
 from ground_station.journal import JOURNAL_FILE, Journal, open_journal
 from ground_station.jump_publisher import JumpPublisher
@@ -68,6 +69,7 @@ class GroundStation:
         *,
         lockstep: bool,
         metrics: GroundMetrics | None = None,
+        external: ExternalMap | None = None,
     ) -> None:
         self._mission, self._bus, self._run, self._lockstep = mission, bus, run, lockstep
         self._recorder = recorder
@@ -98,6 +100,10 @@ class GroundStation:
         bus.on(topics.EVENT, partial(recorder.heard, topics.EVENT, tick=0))
         bus.serve(topics.MAP, MapService(self._feedback).answer)
         bus.serve(topics.BLOCKS, blocks_of(self._replication))
+        if external is not None:
+            external.join(self._news.tell, lambda: "mapper" in bus.alive)
+            bus.on(topics.EXTERNAL_MESH, external.hear)
+            bus.serve(topics.MAP_KEYFRAMES, external.answer)
         bus.watch_lives()
 
     def _hear_state(self, state: DroneState) -> None:
@@ -346,7 +352,10 @@ async def run_ground_station(mission: Mission, link: Link, folder: Path, *, lock
         rehearse(mission)
         journal = open_journal(folder / JOURNAL_FILE)
         with KeyframeLog(folder / KEYFRAMES_FILE) as keyframes, CommandLog(folder / COMMANDS_FILE) as commands:
-            mapper = Mapper(mission, VirtualField.of(mission.target), folder, keyframes)
+            external = None
+            if mission.reconstruction.backend == "external":
+                external = ExternalMap(mission, keyframes, journal.epoch, lockstep=lockstep)
+            mapper = Mapper(mission, VirtualField.of(mission.target), folder, keyframes, external)
             async with connect(link, mission.name, lossless=lockstep) as bus:
                 with _recorder(mission, folder, lockstep=lockstep) as recorder:
                     await GroundStation(
@@ -359,6 +368,7 @@ async def run_ground_station(mission: Mission, link: Link, folder: Path, *, lock
                         recorder,
                         lockstep=lockstep,
                         metrics=GroundMetrics(served.registry),
+                        external=external,
                     ).run()
     finally:
         served.close()

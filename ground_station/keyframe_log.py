@@ -115,6 +115,25 @@ class KeyframeLog:
                 except MessageError as error:
                     log.warning("%s: keyframe at byte %d is left out: %s", self._path, position, error)
 
+    def page(self, first: int, last: int, limit_bytes: int) -> tuple[list[bytes], int]:
+        """Keyframes as they travelled, from position ``first`` to before ``last``, at least one if there is any, more
+        of them up to ``limit_bytes``; and the position behind them. From any thread, also while others append.
+
+        Raises:
+            StorageError: the disk refuses it.
+        """
+        while True:
+            size = min(limit_bytes, last - first)
+            try:
+                data = self._file.read_at(first, size)
+            except OSError as error:
+                raise StorageError(f"{self._path}: {error.strerror}") from error
+            layout = lay_out(data)
+            if layout.contents or size == last - first:
+                whole = [data[content.first : content.last] for content in layout.contents]
+                return whole, first + layout.end if whole else last
+            limit_bytes *= 2
+
     def close(self) -> None:
         self._file.close()
 

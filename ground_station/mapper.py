@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from ground_station.evaluation import FULL_SAMPLES, LIVE_SAMPLES, Scores, Truth, floor_baseline, load_truth, score
+from ground_station.external_map import ExternalMap
 from ground_station.keyframe_log import KeyframeStore
 from ground_station.mesh_change_choice import make_mesh_change
 from ground_station.reconstruction.backends import make_reconstructor
@@ -58,11 +59,19 @@ class MapState:
 class Mapper:
     """Not thread-safe on purpose: all calls come from one worker."""
 
-    def __init__(self, mission: Mission, field: VirtualField, run: Path, keyframes: KeyframeStore) -> None:
-        """``run`` is where the truth is looked for, ``keyframes`` where all that are added are kept."""
+    def __init__(
+        self,
+        mission: Mission,
+        field: VirtualField,
+        run: Path,
+        keyframes: KeyframeStore,
+        external: ExternalMap | None = None,
+    ) -> None:
+        """``run`` is where the truth is looked for, ``keyframes`` where all that are added are kept; ``external`` as
+        for `make_reconstructor`."""
         self._mission, self._run, self._log = mission, run, keyframes
         self._rules: dict[int, KeyframeRule] = {}
-        self._reconstructor = make_reconstructor(mission)
+        self._reconstructor = make_reconstructor(mission, external)
         self._change = make_mesh_change(mission, field)
         self._truth: Truth | None = None
         self._recent: deque[int] = deque(maxlen=self._reconstructor.lookback)
@@ -86,7 +95,7 @@ class Mapper:
     def _read(self, message: messages.Keyframe) -> Keyframe | None:
         """The keyframe in ``message``; None if it cannot be read, or the camera hardly moved since the last."""
         try:
-            keyframe = _decode(message)
+            keyframe = read_keyframe(message)
         except (ReconstructionError, MessageError, UnidentifiedImageError, OSError, ValueError) as error:
             self._unreadable += 1
             log.warning("drone %d: keyframe %d refused: %s", message.drone, message.sequence, error)
@@ -173,7 +182,14 @@ class Mapper:
         return score(mesh.vertices, mesh.faces, self._truth, self._mission.target, samples=samples)
 
 
-def _decode(message: messages.Keyframe) -> Keyframe:
+def read_keyframe(message: messages.Keyframe) -> Keyframe:
+    """What ``message`` shows.
+
+    Raises:
+        ReconstructionError: image, depth or pose are impossible.
+        MessageError: its depth cannot be read.
+        OSError, ValueError: likewise its image.
+    """
     with Image.open(io.BytesIO(message.jpeg), formats=["JPEG"]) as image:
         if image.size != (message.width, message.height):
             raise ReconstructionError(f"image is {image.size}, its message says {(message.width, message.height)}")

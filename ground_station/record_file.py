@@ -135,6 +135,10 @@ class GrowingFile:
         with mmap.mmap(self._file.fileno(), 0, access=mmap.ACCESS_READ) as data:
             yield data
 
+    def read_at(self, place: int, count: int) -> bytes:
+        """From any thread."""
+        return os.pread(self._file.fileno(), count, place)
+
     def append(self, content: bytes, *, synced: bool = False) -> None:
         """``synced``: return when it is on disk, not only with the operating system."""
         self._file.seek(self.end)

@@ -1,9 +1,10 @@
 """Who a process is: its certificate, its key, and the authority by which it knows the others.
 
 A folder that `covrecon pki` filled holds ``ca.pem`` and, for each identity that lives there, ``<identity>.pem`` and
-``<identity>.key``. Identities are ``router``, ``ground``, ``sim``, ``drone-<id>`` and ``operator-<name>``. The common
-name of a certificate is identity and issue, ``drone-3.2``, so that a stolen one can be told from its successor. The
-register lists all that were ever issued; the router admits those that it neither calls revoked nor expired.
+``<identity>.key``. Identities are ``router``, ``ground``, ``sim``, ``mapper``, ``drone-<id>`` and ``operator-<name>``.
+The common name of a certificate is identity and issue, ``drone-3.2``, so that a stolen one can be told from its
+successor. The register lists all that were ever issued; the router admits those that it neither calls revoked nor
+expired.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from protocol.certificates import (
 from protocol.errors import CredentialsError
 
 AUTHORITY_FILE, REGISTER_FILE = "ca.pem", "register.json"
-ROUTER, GROUND, SIM = "router", "ground", "sim"
+ROUTER, GROUND, SIM, MAPPER = "router", "ground", "sim", "mapper"
 DRONE, OPERATOR = "drone", "operator"
 """Kinds of which there are several: ``drone-<id>``, ``operator-<name>``."""
 
@@ -37,12 +38,14 @@ EXPIRY_WARNING = timedelta(days=14)
 """A certificate that ends sooner is warned of: two weeks are enough to visit every drone."""
 
 _IDENTITY = (
-    f"{ROUTER}|{GROUND}|{SIM}"
+    f"{ROUTER}|{GROUND}|{SIM}|{MAPPER}"
     f"|{DRONE}-(?:[1-9][0-9]?|1[0-9]{{2}}|2[0-4][0-9]|25[0-5])"
     f"|{OPERATOR}-[a-z0-9](?:[a-z0-9-]{{0,30}}[a-z0-9])?"
 )
 _ISSUE = "[1-9][0-9]{0,5}"
-IDENTITIES = f"{ROUTER}, {GROUND}, {SIM}, {DRONE}-1 to {DRONE}-255, and {OPERATOR}-<name> of small letters and digits"
+IDENTITIES = (
+    f"{ROUTER}, {GROUND}, {SIM}, {MAPPER}, {DRONE}-1 to {DRONE}-255, and {OPERATOR}-<name> of small letters and digits"
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -376,3 +376,36 @@ class MeshPage(Message):
     complete: bool
     """Whether there was nothing left to say."""
     blocks: tuple[MeshBlock, ...]
+
+
+class KeyframePage(Message):
+    """Reply to ``map/keyframes?epoch=..;from=120``: keyframes for a map that is made elsewhere, all that fit a page."""
+
+    name: ClassVar[str] = "keyframe_page"
+    epoch: Count
+    """Of the list of keyframes; with another one all that was known before is void."""
+    first: Count
+    """Place in the list of the first one, as asked for; 0 of another epoch than asked for."""
+    next: Count
+    """What to ask for next."""
+    keyframes: tuple[bytes, ...]
+    """Encoded `Keyframe`, in the map's order."""
+    wanted: bool
+    """Whether the map of all keyframes before ``next`` is waited for."""
+
+
+class ExternalMesh(Message):
+    """The whole map of an external process, asked for by `KeyframePage.wanted`."""
+
+    name: ClassVar[str] = "external_mesh"
+    epoch: Count
+    taken: Count
+    """All keyframes before this place of their list are in it."""
+    vertices: WireArray
+    """float32 (V, 3) metres, world frame."""
+    faces: WireArray
+    """int32 (F, 3), counter-clockwise seen from the front."""
+    colours: WireArray
+    """uint8 (V, 3) sRGB."""
+    fault: Text = ""
+    """Why there is no map; then the arrays are empty."""

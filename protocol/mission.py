@@ -236,8 +236,9 @@ class Camera(Settings):
 class Reconstruction(Settings):
     """Images to mesh; docs/adr/0004 has the measurements behind it."""
 
-    backend: Literal["plane_sweep", "depth", "none"] = "plane_sweep"
-    """"plane_sweep": depth from images; "depth": that of depth cameras."""
+    backend: Literal["plane_sweep", "depth", "external", "none"] = "plane_sweep"
+    """"plane_sweep": depth from images; "depth": that of depth cameras; "external": a process of your own makes the map
+    (docs/external-reconstructor.md)."""
     sweep_width_px: Annotated[int, Field(ge=32, le=1024)] = 128
     """Width at which depth is computed, or measured by a depth camera; the height follows from the camera."""
     depth_planes: Annotated[int, Field(ge=8, le=256)] = 48
@@ -249,6 +250,8 @@ class Reconstruction(Settings):
     truncation_m: Positive = 0.05
     workers: Annotated[int, Field(ge=1, le=64)] = 2
     """Threads that compute depth maps; the mesh does not depend on it."""
+    external_patience_s: Annotated[float, Field(gt=0, le=60)] = 20.0
+    """Wall time that a flight in lockstep waits for an external process's map, at each update and at the end."""
 
 
 class Simulation(Settings):

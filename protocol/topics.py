@@ -14,9 +14,10 @@ from protocol.errors import MessageError
 from protocol.wire import MAX_MESSAGE_BYTES, Message, decode
 
 M = TypeVar("M", bound=Message)
-Party = Literal["agent", "ground", "sim", "operator", "router"]
-"""Kinds of process. sim: the internal simulator or the observer; operator: console, command line, live table. What the
-router itself reads and writes passes no access rules: they are its own."""
+Party = Literal["agent", "ground", "sim", "operator", "mapper", "router"]
+"""Kinds of process. sim: the internal simulator or the observer; operator: console, command line, live table; mapper: a
+process of the user's own that makes the map. What the router itself reads and writes passes no access rules: they are
+its own."""
 Priority = Literal["REAL_TIME", "INTERACTIVE_HIGH", "INTERACTIVE_LOW", "DATA_HIGH", "DATA", "DATA_LOW", "BACKGROUND"]
 
 
@@ -112,13 +113,17 @@ GROUND_EVENT = Topic("ground/event", messages.Event, ("ground",), ("operator",),
                      "DATA_HIGH", 256, _NO_AGE, True, 16 * _KIB)
 MAP = Topic("map/blocks", messages.MeshPage, ("ground",), ("operator",),
             "BACKGROUND", 4, _NO_AGE, False, MAX_MESSAGE_BYTES, queryable=True)
+MAP_KEYFRAMES = Topic("map/keyframes", messages.KeyframePage, ("ground",), ("mapper",),
+                      "DATA_LOW", 4, _NO_AGE, False, MAX_MESSAGE_BYTES, queryable=True)
+EXTERNAL_MESH = Topic("map/external", messages.ExternalMesh, ("mapper",), ("ground",),
+                      "DATA_LOW", 4, _NO_AGE, False, MAX_MESSAGE_BYTES)
 STATUS = Topic("status", messages.Status, ("ground",), ("operator",),
                "INTERACTIVE_LOW", 4, 5.0, True, 256 * _KIB)
 # fmt: on
 
 TOPICS: tuple[Topic[Message], ...] = (  # type: ignore[assignment]  # read-only use of an invariant generic
     STATE, TEAM, KEYFRAME, SETPOINT, TICK, JUMP, HEAD, JOURNAL, DIGEST, BLOCKS, DRONE_BLOCKS, PHASE, COMMAND,
-    EVENT, GROUND_EVENT, MAP, STATUS,
+    EVENT, GROUND_EVENT, MAP, MAP_KEYFRAMES, EXTERNAL_MESH, STATUS,
 )  # fmt: skip
 
 

@@ -2,16 +2,31 @@
 
 from __future__ import annotations
 
+from ground_station.external_map import ExternalMap
 from ground_station.reconstruction.depth_reconstructor import DepthReconstructor
+from ground_station.reconstruction.external_reconstructor import ExternalReconstructor
 from ground_station.reconstruction.plane_sweep_reconstructor import PlaneSweepReconstructor
 from ground_station.reconstruction.reconstructor import NullReconstructor, Reconstructor
+from protocol.errors import ReconstructionError
 from protocol.mission import Mission
 
 
-def make_reconstructor(mission: Mission) -> Reconstructor:
-    """A new, empty one. Raises `ReconstructionError` if the map would not fit in memory."""
-    if mission.reconstruction.backend == "none":
-        return NullReconstructor()
-    if mission.reconstruction.backend == "depth":
-        return DepthReconstructor(mission)
-    return PlaneSweepReconstructor(mission)
+def make_reconstructor(mission: Mission, external: ExternalMap | None = None) -> Reconstructor:
+    """A new, empty one; ``external``: the process that a mission with that backend flies with.
+
+    Raises:
+        ReconstructionError: the map would not fit in memory, or is another process's that is not here.
+    """
+    match mission.reconstruction.backend:
+        case "none":
+            return NullReconstructor()
+        case "depth":
+            return DepthReconstructor(mission)
+        case "external" if external is not None:
+            return ExternalReconstructor(external)
+        case "external":
+            raise ReconstructionError(
+                'reconstruction.backend "external": that process makes its map in flight alone; choose another one here'
+            )
+        case "plane_sweep":
+            return PlaneSweepReconstructor(mission)

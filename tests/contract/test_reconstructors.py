@@ -2,80 +2,54 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from deploy.examples.external_map import PlaneSweepMap
+from faults.boxes import BOXES, LEG, fly_over, mission, share_right
+from faults.external_process import served
 from ground_station.reconstruction.backends import make_reconstructor
 from ground_station.reconstruction.reconstructor import Keyframe, Mesh, Outcome, Reconstructor
 from protocol.errors import ReconstructionError
 from protocol.geometry import Floats, Intrinsics, camera_rotation
-from protocol.mission import Camera, Drone, Mission, Reconstruction, Target
+from protocol.mission import Target
 
-CAMERA = Camera(width_px=160, height_px=90)
-BOXES = (((-0.45, -0.35, 0.0), (0.05, 0.25, 0.35)), ((0.4, -0.2, 0.0), (0.8, 0.4, 0.5)))
-HIGHEST = 0.5
-"""m, top of the taller box."""
-SETTINGS = Reconstruction(sweep_width_px=96, depth_planes=32, nearest_m=0.6, farthest_m=2.5)
-LEG = 14
-"""Keyframes of one drone's flight over the boxes."""
-
-
-def mission(backend: str = "plane_sweep", workers: int = 1) -> Mission:
-    return Mission(
-        target=Target(lower_m=(-1, -1, 0), upper_m=(1, 1, 0.8)),
-        camera=CAMERA,
-        reconstruction=SETTINGS.model_copy(update={"backend": backend, "workers": workers}),
-        drones=(Drone(id=1, start=(0, 0, 2, 0, 1.4)),),
-    )
-
-
-def texture(x: Floats, y: Floats) -> Floats:
-    rng = np.random.default_rng(3)
-    total = np.full_like(x, 128.0)
-    for _ in range(24):
-        direction, phase = rng.uniform(0, 2 * np.pi, 2)
-        wave = 2 * np.pi / (0.05 * 10 ** rng.uniform(0, 1))
-        total += 14 * np.sin(wave * (x * np.cos(direction) + y * np.sin(direction)) + phase)
-    return total
-
-
-def photograph(position: Floats, rotation: Floats, camera: Intrinsics) -> NDArray[np.uint8]:
-    """RGB image of the floor z = 0 and the boxes; (H, W, 3)."""
-    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones_like(rows)], axis=-1)
-    rays = rays @ rotation.T
-    depth, side = -position[2] / rays[..., 2], np.full(rows.shape, 2)
-    for lower, upper in BOXES:
-        one, two = (np.array(lower) - position) / rays, (np.array(upper) - position) / rays
-        entry = np.minimum(one, two)
-        hit = (entry.max(axis=-1) < np.maximum(one, two).min(axis=-1)) & (entry.max(axis=-1) > 0)
-        depth, side = np.where(hit, entry.max(axis=-1), depth), np.where(hit, entry.argmax(axis=-1), side)
-    points = position + depth[..., None] * rays
-    across = np.where(side == 0, points[..., 1], points[..., 0])
-    along = np.where(side == 2, points[..., 1] + points[..., 2], points[..., 2] + 7.0)
-    grey = np.clip(texture(across, along), 0, 255)
-    return np.stack([grey, 0.8 * grey, 0.6 * grey], axis=-1).astype(np.uint8)
-
-
-def keyframe(sequence: int, x: float, y: float, drone: int = 1, yaw: float = 0.0) -> Keyframe:
-    position = np.array([x, y, 1.4 + 0.05 * np.sin(sequence)])
-    rotation = camera_rotation(yaw + 0.1 * np.sin(2.0 * sequence), 1.35 + 0.1 * np.sin(sequence))
-    camera = CAMERA.intrinsics()
-    return Keyframe(drone, sequence, 5 * sequence, photograph(position, rotation, camera), position, rotation, camera)
+Make = Callable[[], Reconstructor]
+MAPPING = ("plane_sweep", "depth", "external")
+"""Backends that make a map."""
+BACKENDS = (*MAPPING, "none")
+mapping = pytest.mark.parametrize("backend", MAPPING, indirect=True)
 
 
 @pytest.fixture(scope="module")
 def flight() -> list[Keyframe]:
-    """Two drones on parallel lines over the boxes, their keyframes interleaved as they arrive."""
-    pairs = [
-        (keyframe(n, -0.8 + 0.12 * n, -0.1), keyframe(n, 0.8 - 0.12 * n, 0.15, drone=2, yaw=2.0)) for n in range(LEG)
-    ]
-    return [one for pair in pairs for one in pair]
+    return fly_over()
+
+
+@pytest.fixture(params=BACKENDS)
+def backend(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+def make(backend: str, tmp_path: Path) -> Iterator[Make]:
+    """New ones of the backend; of the external one, with the same process behind all."""
+    own = mission(backend)
+    if backend == "external":
+        with served(own, tmp_path, lambda: PlaneSweepMap(own)) as life:
+            yield life
+    else:
+        yield lambda: make_reconstructor(own)
+
+
+@pytest.fixture
+def reconstructor(make: Make) -> Reconstructor:
+    return make()
 
 
 def fly(reconstructor: Reconstructor, flight: Sequence[Keyframe]) -> list[Outcome]:
@@ -101,11 +75,6 @@ def blurred(sharp: Keyframe) -> Keyframe:
     """Motion blur along the image's rows, a seventh of its width."""
     image = np.mean([np.roll(sharp.image, shift, axis=1) for shift in range(23)], axis=0).astype(np.uint8)
     return replace(sharp, image=image)
-
-
-@pytest.fixture(params=["plane_sweep", "none"])
-def reconstructor(request: pytest.FixtureRequest) -> Reconstructor:
-    return make_reconstructor(mission(request.param))
 
 
 def test_a_new_reconstructor_has_an_empty_mesh_and_nothing_to_flush(reconstructor: Reconstructor) -> None:
@@ -141,7 +110,7 @@ def test_bad_images_are_survived(reconstructor: Reconstructor, flight: list[Keyf
         replace(blurred(first), sequence=2, tick=2),
         replace(first, sequence=3, tick=3),
         replace(first, sequence=4, tick=4),
-        replace(first, sequence=5, tick=5, image=first.image[:6, :8], intrinsics=tiny),
+        replace(first, sequence=5, tick=5, image=first.image[:6, :8], intrinsics=tiny, depth=None),
         replace(first, sequence=6, tick=6, image=flight[2].image, position=np.array([90.0, 0.0, 1.0])),
         replace(first, sequence=7, tick=7, image=flight[4].image, rotation=camera_rotation(0.0, -1.5)),
     ]
@@ -165,27 +134,27 @@ def test_keyframes_may_follow_a_flush(reconstructor: Reconstructor, flight: list
     assert_sound(reconstructor.mesh())
 
 
-def restart(old: Reconstructor, backend: str, given: Sequence[Keyframe], workers: int = 1) -> Reconstructor:
+def restart(old: Reconstructor, make: Make, given: Sequence[Keyframe]) -> Reconstructor:
     """A new reconstructor in the state of one that was given those keyframes."""
-    new = make_reconstructor(mission(backend, workers))
+    new = make()
     new.restore(old.state(), iter(given[max(0, len(given) - old.lookback) :]))
     return new
 
 
-@pytest.mark.parametrize("backend", ["plane_sweep", "none"])
 @pytest.mark.parametrize("cut", [0, 2, 7, 16, 2 * LEG])
 def test_a_restored_reconstructor_has_the_same_mesh_and_takes_up_where_the_other_was(
-    flight: list[Keyframe], backend: str, cut: int
+    flight: list[Keyframe], make: Make, cut: int
 ) -> None:
-    old = make_reconstructor(mission(backend))
+    old = make()
     decided = {
         (outcome.drone, outcome.sequence)
         for start in range(0, cut, 2)
         for outcome in old.add(flight[start : min(start + 2, cut)])
         if outcome.state != "waiting"
     }
-    new = restart(old, backend, flight[:cut])
-    assert contents(new.mesh()) == contents(old.mesh())
+    before = contents(old.mesh())
+    new = restart(old, make, flight[:cut])
+    assert contents(new.mesh()) == before
     assert new.statistics() == old.statistics()
 
     again = {(one.drone, one.sequence): one for one in fly(new, flight[cut:]) if one.state != "waiting"}
@@ -206,15 +175,14 @@ def test_a_state_belongs_to_the_caller(reconstructor: Reconstructor, flight: lis
 
 
 def test_keyframes_given_again_after_a_restart_are_not_taken_twice(
-    reconstructor: Reconstructor, request: pytest.FixtureRequest, flight: list[Keyframe]
+    reconstructor: Reconstructor, backend: str, make: Make, flight: list[Keyframe]
 ) -> None:
-    backend = request.node.callspec.params["reconstructor"]
     for start in range(0, 12, 2):
         reconstructor.add(flight[start : start + 2])
-    new = restart(reconstructor, backend, flight[:12])
+    new = restart(reconstructor, make, flight[:12])
     before = contents(new.mesh())
     outcomes = new.add(flight[:12])[:12]
-    assert backend == "none" or {outcome.reason for outcome in outcomes} == {"repeated"}
+    assert backend in ("none", "external") or {outcome.reason for outcome in outcomes} == {"repeated"}
     assert contents(new.mesh()) == before
 
 
@@ -227,6 +195,11 @@ def test_keyframes_given_again_after_a_restart_are_not_taken_twice(
         ({"rotation": 2.0 * np.eye(3)}, "orthonormal"),
         ({"image": np.zeros((90, 90, 3), np.uint8)}, "image"),
         ({"image": np.zeros((90, 160, 3), np.float32)}, "image"),
+        ({"depth": np.ones((54, 54), np.float32)}, "not the image's shape"),
+        ({"depth": np.ones((54, 96), np.float64)}, "expected float32"),
+        ({"depth": np.zeros((0, 0), np.float32)}, "expected float32"),
+        ({"depth": np.full((54, 96), np.nan, np.float32)}, "depth is not finite"),
+        ({"depth": np.full((54, 96), -1.0, np.float32)}, "negative"),
     ],
 )
 def test_an_impossible_keyframe_cannot_be_made(
@@ -234,6 +207,89 @@ def test_an_impossible_keyframe_cannot_be_made(
 ) -> None:
     with pytest.raises(ReconstructionError, match=complaint):
         replace(flight[0], **change)  # type: ignore[arg-type]  # wrong on purpose
+
+
+@mapping
+def test_the_map_is_where_the_boxes_and_the_floor_are(make: Make, flight: list[Keyframe]) -> None:
+    reconstructor = make()
+    fly(reconstructor, flight)
+    mesh = reconstructor.mesh()
+    assert_sound(mesh)
+    assert len(mesh.faces) > 5000
+    assert share_right(mesh) > 0.9
+
+
+@mapping
+def test_cameras_of_the_other_handedness_map_nothing(make: Make, flight: list[Keyframe]) -> None:
+    """As graphics libraries have them: y up and looking along -z."""
+    reconstructor = make()
+    fly(reconstructor, [replace(one, rotation=one.rotation @ np.diag([1.0, -1.0, -1.0])) for one in flight])
+    assert reconstructor.mesh().faces.size == 0
+
+
+@mapping
+def test_poses_in_another_unit_than_metres_are_survived(make: Make, flight: list[Keyframe]) -> None:
+    for factor in (1000.0, 0.001):
+        reconstructor = make()
+        fly(reconstructor, [replace(one, position=factor * one.position) for one in flight])
+        assert_sound(reconstructor.mesh())
+
+
+@mapping
+def test_a_frozen_camera_changes_nothing(make: Make, backend: str, flight: list[Keyframe]) -> None:
+    frozen = []
+    for place, one in enumerate(flight):
+        again = replace(flight[12], tick=one.tick, position=one.position, rotation=one.rotation)
+        frozen.append(again if place > 12 and one.drone == flight[12].drone else one)
+    reconstructor = make()
+    outcomes = fly(reconstructor, frozen)
+    assert share_right(reconstructor.mesh()) > 0.9
+    assert backend == "external" or sum(outcome.reason == "repeated" for outcome in outcomes) == LEG - 7
+
+
+@mapping
+def test_blurred_and_black_images_do_not_spoil_the_map(make: Make, flight: list[Keyframe]) -> None:
+    spoiled = list(flight)
+    for place in (4, 9, 14):
+        spoiled[place] = blurred(flight[place])
+        spoiled[place + 3] = replace(flight[place + 3], image=np.zeros_like(flight[place + 3].image))
+    reconstructor = make()
+    fly(reconstructor, spoiled)
+    mesh = reconstructor.mesh()
+    assert len(mesh.faces) > 4000
+    assert share_right(mesh) > 0.9
+
+
+@mapping
+def test_keyframes_without_overlap_make_no_map(make: Make, backend: str, flight: list[Keyframe]) -> None:
+    apart = [flight[0], replace(flight[-2], tick=900)]
+    reconstructor = make()
+    outcomes = fly(reconstructor, apart)
+    assert reconstructor.mesh().faces.size == 0
+    assert backend == "external" or [one.reason for one in outcomes if one.reason] == ["no_overlap"] * 2
+
+
+@mapping
+def test_a_pose_outlier_is_kept_out_of_the_map(make: Make, backend: str, flight: list[Keyframe]) -> None:
+    aside = list(flight)
+    aside[10] = replace(flight[10], position=flight[10].position + np.array([0.05, 0.1, 0.3]))
+    aside[17] = replace(flight[17], rotation=camera_rotation(0.5, 1.0))
+    reconstructor = make()
+    outcomes = fly(reconstructor, aside)
+    assert share_right(reconstructor.mesh()) > 0.88
+    refused = {(one.drone, one.sequence) for one in outcomes if one.reason}
+    assert backend == "external" or {(one.drone, one.sequence) for one in (flight[10], flight[17])} <= refused
+
+
+@mapping
+def test_keyframes_out_of_order_make_no_wrong_map(make: Make, flight: list[Keyframe]) -> None:
+    """Each drone's second of three comes last."""
+    order = [place + step for place in range(0, 24, 6) for step in (0, 1, 4, 5, 2, 3)]
+    reconstructor = make()
+    outcomes = fly(reconstructor, [flight[place] for place in order])
+    decided = [(outcome.drone, outcome.sequence) for outcome in outcomes if outcome.state != "waiting"]
+    assert sorted(decided) == sorted((flight[place].drone, flight[place].sequence) for place in order)
+    assert share_right(reconstructor.mesh()) > 0.88
 
 
 # What follows holds for the plane sweep alone.
@@ -248,13 +304,8 @@ def boxes(flight: list[Keyframe]) -> Mesh:
 
 def test_the_boxes_and_the_floor_are_found_where_they_are(boxes: Mesh) -> None:
     assert_sound(boxes)
-    inside = boxes.vertices[np.abs(boxes.vertices[:, :2]).max(axis=1) < 0.9].astype(float)
-    away = np.abs(inside[:, 2])
-    for lower, upper in BOXES:
-        outside = np.maximum(np.maximum(np.array(lower) - inside, inside - np.array(upper)), 0.0)
-        depth = np.minimum(inside - np.array(lower), np.array(upper) - inside).min(axis=1)
-        away = np.minimum(away, np.maximum(np.linalg.norm(outside, axis=1), depth))
-    assert np.mean(away < 0.025) > 0.9
+    assert share_right(boxes) > 0.9
+    inside = boxes.vertices
     for lower, upper in BOXES:
         middle = [(low + high) / 2 for low, high in zip(lower[:2], upper[:2], strict=True)]
         above = np.abs(inside[:, :2] - middle).max(axis=1) < 0.1
@@ -291,7 +342,7 @@ def test_a_map_across_a_restart_is_as_good_as_one_without(boxes: Mesh, flight: l
     old = make_reconstructor(mission())
     for start in range(0, 14, 2):
         old.add(flight[start : start + 2])
-    new = restart(old, "plane_sweep", flight[:14])
+    new = restart(old, lambda: make_reconstructor(mission()), flight[:14])
     fly(new, flight[14:])
     found, expected = new.mesh(), boxes
     assert len(found.vertices) == pytest.approx(len(expected.vertices), rel=0.01)
@@ -305,7 +356,7 @@ def test_two_restarts_from_the_same_checkpoint_make_the_same_map(flight: list[Ke
         old.add(flight[start : start + 2])
     meshes = []
     for workers in (1, 2):
-        new = restart(old, "plane_sweep", flight[:14], workers)
+        new = restart(old, lambda workers=workers: make_reconstructor(mission(workers=workers)), flight[:14])
         fly(new, flight[14:])
         meshes.append(contents(new.mesh()))
     assert meshes[0] == meshes[1]
