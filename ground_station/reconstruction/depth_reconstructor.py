@@ -14,7 +14,7 @@ from typing import Final, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from ground_station.reconstruction.consistency import TOLERANCE
+from ground_station.reconstruction.depth_check import COMPARED_MIN, NEAREST_M, Measured, fault_of
 from ground_station.reconstruction.depth_range import depth_range
 from ground_station.reconstruction.fusion import Volume
 from ground_station.reconstruction.reconstructor import Keyframe, Mesh, Outcome, Refusal, State, Statistics
@@ -29,14 +29,10 @@ PATIENCE_S: Final = 3.0
 """Mission time after which a hovering drone's last keyframe is used without a later one."""
 VIEWS_KEPT: Final = 512
 """Newest keyframes that others may be compared with."""
-NEAREST_M: Final = 0.05
-"""What is nearer is the camera's own fault: a finger, or metres where millimetres were meant."""
-KNOWN_MIN: Final = 0.05
-"""Least share of the pixels with depth, and of those that others can be compared in."""
+BYTES_PER_PIXEL: Final = 8
+"""Of a kept keyframe: grey, color and depth."""
 INSIDE_MIN: Final = 0.01
 """Least share of the pixels whose surface lies in the box to be mapped."""
-CONFIRMED_MIN: Final = 0.4
-"""Least share of the compared depths that others confirm, as of the plane sweep."""
 WEIGHT_MIN: Final = 0.3
 """Weight from which a voxel is part of the map, as of the plane sweep."""
 
@@ -48,9 +44,8 @@ class _Entry:
     tick: int
     rank: int
     """Number of the drone's keyframes that were taken in before it."""
-    view: View
+    measured: Measured
     color: NDArray[np.uint8]
-    depth: NDArray[np.float32]
     typical: float
     """m: median of its depths."""
 
@@ -84,7 +79,7 @@ class DepthReconstructor:
         return extract_mesh(self._volume, WEIGHT_MIN)
 
     def statistics(self) -> Statistics:
-        kept = sum(entry.depth.nbytes + entry.color.nbytes + entry.view.grey.nbytes for entry in self._kept if entry)
+        kept = sum(BYTES_PER_PIXEL * entry.measured.depth.size for entry in self._kept if entry)
         return Statistics(
             received=self._received,
             fused=self._fused,
@@ -127,16 +122,17 @@ class DepthReconstructor:
         if keyframe.tick <= self._newest.get(keyframe.drone, -1) or (last is not None and np.array_equal(depth, last)):
             return self._refuse(keyframe, "repeated")
         height, width = depth.shape
-        if np.count_nonzero(depth) < KNOWN_MIN * depth.size:
+        if np.count_nonzero(depth) < COMPARED_MIN * depth.size:
             return self._refuse(keyframe, "no_depth")
         color = shrink(keyframe.image, width, height)
         camera = keyframe.intrinsics.scaled_to(width, height)
         view = View(to_grey(color), keyframe.position, keyframe.rotation, camera)
-        if not self._shows_the_box(view, depth):
+        measured = Measured(view, depth)
+        if not self._shows_the_box(measured):
             return self._refuse(keyframe, "off_target")
         typical = float(np.median(depth[depth > 0]))
         rank = self._taken[keyframe.drone]
-        entry = _Entry(keyframe.drone, keyframe.sequence, keyframe.tick, rank, view, color, depth, typical)
+        entry = _Entry(keyframe.drone, keyframe.sequence, keyframe.tick, rank, measured, color, typical)
         self._taken[keyframe.drone] += 1
         self._newest[keyframe.drone] = keyframe.tick
         self._newest_depth[keyframe.drone] = depth
@@ -144,13 +140,13 @@ class DepthReconstructor:
         self._waiting.append(entry)
         return Outcome(keyframe.drone, keyframe.sequence, "waiting")
 
-    def _shows_the_box(self, view: View, depth: NDArray[np.float32]) -> bool:
+    def _shows_the_box(self, measured: Measured) -> bool:
         margin = self._settings.truncation_m
-        if depth_range(view, self._box, margin) is None:
+        if depth_range(measured.view, self._box, margin) is None:
             return False
-        points = _surface(view, depth)
+        points = measured.surface()
         inside = (points > np.array(self._box.lower_m) - margin) & (points < np.array(self._box.upper_m) + margin)
-        return bool(np.count_nonzero(inside.all(axis=1)) >= INSIDE_MIN * depth.size)
+        return bool(np.count_nonzero(inside.all(axis=1)) >= INSIDE_MIN * measured.depth.size)
 
     def _decide(self, everything: bool = False) -> list[Outcome]:
         """Fuse or refuse what need not wait any longer, in the order in which it came."""
@@ -165,55 +161,16 @@ class DepthReconstructor:
         return [self._fuse(entry) for entry in due]
 
     def _fuse(self, entry: _Entry) -> Outcome:
-        slots = self._index.sources(entry.view, entry.typical, self._settings.sources)
-        others = [(other.view, other.depth) for slot in slots if (other := self._kept[slot]) is not None]
-        fault = fault_of(entry.view, entry.depth, others)
+        view, depth = entry.measured.view, entry.measured.depth
+        slots = self._index.sources(view, entry.typical, self._settings.sources)
+        fault = fault_of(entry.measured, [other.measured for slot in slots if (other := self._kept[slot]) is not None])
         if fault is not None:
             return self._refuse(entry, fault)
-        weight = np.maximum(entry.depth, np.float32(self._settings.nearest_m)) ** np.float32(-2)
-        self._volume.integrate(entry.view, entry.depth, weight, entry.color)
+        weight = np.maximum(depth, np.float32(self._settings.nearest_m)) ** np.float32(-2)
+        self._volume.integrate(view, depth, weight, entry.color)
         self._fused += 1
         return Outcome(entry.drone, entry.sequence, "fused")
 
     def _refuse(self, keyframe: Keyframe | _Entry, reason: Refusal) -> Outcome:
         self._refused[reason] += 1
         return Outcome(keyframe.drone, keyframe.sequence, "refused", reason)
-
-
-def fault_of(
-    view: View, depth: NDArray[np.float32], others: Sequence[tuple[View, NDArray[np.float32]]]
-) -> Refusal | None:
-    """Why ``depth`` (H, W) of ``view`` cannot be believed, by what ``others`` measured; None if it can."""
-    if not others:
-        return "no_overlap"
-    points = _surface(view, depth)
-    ratios = np.stack([_ratios(points, *other) for other in others])
-    compared = np.count_nonzero((ratios > 0).any(axis=0))
-    if compared < KNOWN_MIN * depth.size:
-        return "no_overlap"
-    if np.count_nonzero((np.abs(ratios - 1) < TOLERANCE).any(axis=0)) >= CONFIRMED_MIN * compared:
-        return None
-    factor = np.median(ratios[ratios > 0])
-    alike = np.count_nonzero((np.abs(ratios / factor - 1) < TOLERANCE).any(axis=0))
-    return "wrong_scale" if alike >= CONFIRMED_MIN * compared else "no_depth"
-
-
-def _surface(view: View, depth: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(N, 3) m, world: what the pixels with depth show."""
-    rows, columns = np.nonzero(depth)
-    pixels = np.column_stack([columns, rows, np.ones(rows.size)])
-    rays = pixels @ np.linalg.inv(view.calibration).T @ view.rotation.T  # one metre of depth each
-    points: NDArray[np.float64] = view.position + depth[rows, columns, None] * rays
-    return points
-
-
-def _ratios(points: NDArray[np.float64], view: View, depth: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(N,) what ``view`` measured where it should see ``points`` (N, 3), as a multiple of their depth; 0: nothing."""
-    height, width = depth.shape
-    seen = (points - view.position) @ view.rotation @ view.calibration.T
-    ahead = np.maximum(seen[:, 2], NEAREST_M)
-    columns, rows = (np.rint(seen[:, axis] / ahead).clip(-1, size) for axis, size in ((0, width), (1, height)))
-    within = (seen[:, 2] > NEAREST_M) & (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    found = np.zeros(len(points))
-    found[within] = depth[rows[within].astype(int), columns[within].astype(int)] / ahead[within]
-    return found
