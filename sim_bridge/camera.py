@@ -101,9 +101,10 @@ def add_depth_noise(
     """``depth`` (H, W) m with independent normal noise of standard deviation ``near_m + per_m * depth ** 2``."""
     if near_m <= 0 and per_m <= 0:
         return depth
-    draws = rng.integers(0, 1 << _NOISE_BITS, depth.shape)
-    noise = _normal_quantiles().astype(np.float32)[draws] * (near_m + per_m * depth * depth)
-    return np.where(np.isfinite(depth), depth + noise, depth).astype(np.float32)
+    noise = _normal_quantiles()[rng.integers(0, 1 << _NOISE_BITS, depth.shape)]
+    known = np.isfinite(depth)
+    spread = near_m + per_m * np.square(depth, where=known, out=np.zeros_like(depth))
+    return np.where(known, depth + np.where(known, noise * spread, 0), depth).astype(np.float32)
 
 
 @cache

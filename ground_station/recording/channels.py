@@ -34,8 +34,8 @@ from protocol.field import VirtualField
 from protocol.mission import Mission
 
 Kind: TypeAlias = Literal[
-    "mission", "state", "keyframe", "event", "phase", "status", "hand_over", "look", "integrated", "jump", "phi",
-    "mesh", "metrics", "summary",
+    "mission", "state", "depth", "keyframe", "event", "phase", "status", "hand_over", "look", "integrated", "jump",
+    "phi", "mesh", "metrics", "summary",
 ]  # fmt: skip
 
 MISSION: Final = "/mission"
@@ -62,7 +62,8 @@ _STATUS: Final = "/ground/status"
 CHANNELS: Final[Mapping[Kind, tuple[str, ...]]] = {
     "mission": (MISSION,),
     "state": (_TRANSFORMS, _POSE, STATE),
-    "keyframe": (_CALIBRATION, CAMERA, DEPTH, KEYFRAME),
+    "depth": (DEPTH,),
+    "keyframe": (_CALIBRATION, CAMERA, KEYFRAME),
     "event": (_LOG, EVENT),
     "phase": (_PHASE,),
     "status": (_STATUS,),
@@ -168,11 +169,11 @@ class Channels:
                 self._show(_TRANSFORMS, shapes.transforms(content, time_ns), time_ns)
                 self._show(_POSE, shapes.pose(content, time_ns), time_ns, content.drone)
                 self._store(STATE, content, time_ns, content.drone)
+            case "depth":
+                self._show(DEPTH, shapes.depth(content, time_ns), time_ns, content.drone)
             case "keyframe":
                 self._show(_CALIBRATION, shapes.calibration(content, time_ns), time_ns, content.drone)
                 self._show(CAMERA, shapes.image(content, time_ns), time_ns, content.drone)
-                if content.depth:
-                    self._show(DEPTH, shapes.depth(content, time_ns), time_ns, content.drone)
                 self._log(KEYFRAME, content.model_dump_json(exclude=IMAGES).encode(), time_ns, content.drone)
             case "event":
                 self._show(_LOG, shapes.log_line(content, time_ns), time_ns)

@@ -144,6 +144,8 @@ class Recorder:
             if message == self._phase:
                 return
             self._phase = message
+        if isinstance(message, messages.Keyframe) and message.depth:
+            self._offer("depth", message, message.tick, drone)
         self._offer(_KINDS[topic.key], message, getattr(message, "tick", tick), drone)
 
     def handed_over(self, tick: int, keyframes: Sequence[messages.Keyframe]) -> None:

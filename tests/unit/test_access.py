@@ -13,9 +13,19 @@ from protocol.topics import TOPICS, Topic, alive_key
 from protocol.wire import Message
 
 NAMESPACE = "covrecon/m"
-ADMITTED = ("router.1", "ground.2", "sim.1", "drone-1.1", "drone-1.2", "drone-2.1", "drone-9.1", "operator-anna.1")
+ADMITTED = (
+    "router.1",
+    "ground.2",
+    "sim.1",
+    "drone-1.1",
+    "drone-1.2",
+    "drone-2.1",
+    "drone-9.1",
+    "operator-anna.1",
+    "mapper.1",
+)
 DRONES = {1, 2}
-PARTY = {"ground": "ground", "sim": "sim", "drone-1": "agent", "operator-anna": "operator"}
+PARTY = {"ground": "ground", "sim": "sim", "drone-1": "agent", "operator-anna": "operator", "mapper": "mapper"}
 each_topic = pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.key)
 each_identity = pytest.mark.parametrize("identity", PARTY)
 
@@ -83,7 +93,7 @@ def test_a_drone_writes_no_other_drones_keys(control: Mapping[str, Any], topic: 
 
 
 def test_each_process_lives_under_its_own_name_alone(control: Mapping[str, Any]) -> None:
-    roles = {"ground": "ground", "sim": "sim", "drone-1": "drone/1", "drone-2": "drone/2"}
+    roles = {"ground": "ground", "sim": "sim", "drone-1": "drone/1", "drone-2": "drone/2", "mapper": "mapper"}
     for identity in (*roles, "operator-anna"):
         for role in roles.values():
             alone = roles.get(identity) == role

@@ -4,8 +4,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from protocol.depth_image import decode_depth
 from protocol.geometry import Intrinsics, camera_rotation
-from sim_bridge.camera import BACKGROUND, Camera, add_noise
+from protocol.mission import Camera as CameraSettings
+from protocol.mission import Drone, Mission, Reconstruction
+from sim_bridge.camera import BACKGROUND, Camera, add_depth_noise, add_noise
+from sim_bridge.photographer import Photographer
 from sim_bridge.rasteriser import NEAR_M
 from sim_bridge.scenes.scene import Scene, pack_scene
 from sim_bridge.scenes.surfaces import Material, Surfaces, box, join, quad
@@ -216,3 +220,38 @@ def test_noise_is_clipped_and_zero_noise_changes_nothing() -> None:
     assert (add_noise(np.full((40, 40, 3), 255, np.uint8), 5.0, rng) > 215).all()
     image = np.full((40, 40, 3), 7, np.uint8)
     assert np.array_equal(add_noise(image, 0.0, rng), image)
+
+
+def test_noise_of_depth_grows_with_its_square_and_leaves_nothing_where_nothing_is() -> None:
+    near, far = np.full((200, 200), 0.5, np.float32), np.full((200, 200), 3.0, np.float32)
+    far[0] = np.inf
+    noisy = [add_depth_noise(depth, 0.002, 0.003, np.random.default_rng(2)) for depth in (near, far)]
+    assert noisy[0].dtype == np.float32
+    assert noisy[0].std() == pytest.approx(0.002 + 0.003 * 0.25, rel=0.02)
+    assert noisy[1][1:].std() == pytest.approx(0.002 + 0.003 * 9, rel=0.02)
+    assert noisy[1][1:].mean() == pytest.approx(3.0, abs=0.001)
+    assert np.isposinf(noisy[1][0]).all()
+    again = add_depth_noise(far, 0.002, 0.003, np.random.default_rng(2))
+    np.testing.assert_array_equal(again, noisy[1])
+    assert add_depth_noise(near, 0.0, 0.0, np.random.default_rng(2)) is near
+
+
+def test_a_drone_with_a_depth_camera_measures_what_its_camera_sees() -> None:
+    mission = Mission(
+        camera=CameraSettings(width_px=160, height_px=90, depth=True),
+        reconstruction=Reconstruction(sweep_width_px=64),
+        drones=(Drone(id=1, start=(0, 0, 2, 0, 1.4)),),
+    )
+    room = scene(floor())
+    cameras = Camera(room, mission.camera.intrinsics()), Camera(room, mission.sweep_intrinsics())
+    kept = []
+    for _ in range(2):
+        photographer = Photographer(mission, *cameras)
+        (shot,) = photographer.due(4, {1: np.array([0.0, 0.0, 2.0, 0.3, math.pi / 2])})
+        kept.append(photographer.take(shot))
+    assert kept[0] == kept[1], "the same seed, the same bytes"
+    depth = decode_depth(kept[0].depth, 160, 90)
+    assert depth.shape == (36, 64)
+    assert depth.mean() == pytest.approx(2.0, abs=0.002)
+    assert 0.01 < depth.std() < 0.02
+    assert Photographer(mission, cameras[0]).take(shot).depth == b""

@@ -13,6 +13,7 @@ from ground_station.keyframe_log import KeyframeLog
 from ground_station.record_file import HEAD_BYTES, record
 from protocol.errors import StorageError
 from protocol.messages import Keyframe
+from protocol.wire import decode
 
 
 def keyframe(number: int) -> Keyframe:
@@ -170,3 +171,33 @@ def test_a_disk_that_does_not_sync_is_an_error_to_who_relies_on_it(path: Path, m
         monkeypatch.setattr(os, "fdatasync", fail)
         with pytest.raises(StorageError, match="Input/output error"):
             log.sync()
+
+
+def test_pages_of_keyframes_as_they_travelled_hold_each_once(tmp_path: Path) -> None:
+    with KeyframeLog(tmp_path / "keyframes") as log:
+        for one in FLOWN:
+            log.append(one)
+        place, found = 0, []
+        while place < log.end:
+            contents, place = log.page(place, log.end, 300)
+            assert 1 <= len(contents) <= 2
+            found += contents
+        assert [decode(Keyframe, content) for content in found] == FLOWN
+        assert log.page(log.end, log.end, 300) == ([], log.end)
+
+
+def test_a_page_leaves_out_what_is_damaged_and_ends_where_it_is_told_to(tmp_path: Path) -> None:
+    path = tmp_path / "keyframes"
+    with KeyframeLog(path) as log:
+        places = []
+        for one in FLOWN:
+            places.append(log.end)
+            log.append(one)
+        with path.open("r+b") as file:
+            file.seek(places[2] + HEAD_BYTES + 3)
+            file.write(b"\xff\xff")
+        contents, place = log.page(places[1], places[5], 10_000)
+        assert [decode(Keyframe, content) for content in contents] == [FLOWN[1], FLOWN[3], FLOWN[4]]
+        assert place == places[5]
+        contents, place = log.page(places[2], places[5], 50)
+        assert decode(Keyframe, contents[0]) == FLOWN[3]

@@ -16,6 +16,7 @@ from PIL import Image
 from ground_station.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from ground_station.keyframe_log import KeyframeLog
 from ground_station.mapper import Mapper, MapState
+from protocol.depth_image import encode_depth
 from protocol.errors import StorageError
 from protocol.field import VirtualField
 from protocol.geometry import camera_rotation
@@ -276,3 +277,34 @@ def test_without_feedback_no_time_of_its_update_is_told(tmp_path: Path) -> None:
     silent.faces()
     assert silent.mapper.feedback_update_s is None
     silent.log.close()
+
+
+@pytest.mark.parametrize("depth", [b"no image", encode_depth(np.ones((72, 72), np.float32))])
+def test_a_keyframe_whose_depth_is_none_is_refused_and_counted(tmp_path: Path, depth: bytes) -> None:
+    station = Station(tmp_path)
+    station.add([one.model_copy(update={"depth": depth}) for one in FLIGHT[:3]])
+    assert station.mapper.refused == 3
+    assert station.log.count == 3
+    station.log.close()
+
+
+def test_measured_depth_survives_a_crash_with_its_keyframe(tmp_path: Path) -> None:
+    mission = MISSION.model_copy(
+        update={"reconstruction": MISSION.reconstruction.model_copy(update={"backend": "depth"})}
+    )
+    flight = [
+        one.model_copy(update={"depth": encode_depth(np.full((54, 96), HEIGHT_M + 1e-3 * one.sequence, np.float32))})
+        for one in FLIGHT
+    ]
+    first = Station(tmp_path, mission)
+    first.add(flight)
+    expected = first.mapper.finish().mesh
+    assert len(expected.faces) > 100
+    assert np.median(np.abs(expected.vertices[:, 2])) < 0.02
+    first.log.close()
+
+    second = Station(tmp_path, mission)
+    assert second.mapper.restore(None) == LEG
+    found = second.mapper.finish().mesh
+    np.testing.assert_array_equal(found.vertices, expected.vertices)
+    second.log.close()

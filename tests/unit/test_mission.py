@@ -127,6 +127,21 @@ def test_the_nearest_depth_lies_before_the_farthest() -> None:
     assert "nearest_m: must be less than farthest_m" in faults(changed(("reconstruction", "nearest_m"), 4.2))
 
 
+@pytest.mark.parametrize("place", [("camera", "depth"), ("reconstruction", "backend")])
+def test_a_real_camera_gives_no_depth(place: Place) -> None:
+    settings = changed(place, True if place[0] == "camera" else "depth")
+    assert Mission.model_validate(settings).measures_depth
+    settings["vehicles"]["kind"] = "px4"
+    settings["drones"][1]["camera"] = "/dev/video0"
+    assert "drones.1.camera: gives no depth" in faults(settings)
+
+
+def test_depth_is_measured_at_the_width_of_the_sweep() -> None:
+    camera = Mission.model_validate(changed(("reconstruction", "sweep_width_px"), 160)).sweep_intrinsics()
+    assert (camera.width, camera.height) == (160, 90)
+    assert not Mission.model_validate(TWO).measures_depth
+
+
 def test_all_faults_of_a_team_are_told_at_once() -> None:
     settings = changed(("drones", 1), {"id": 1, "start": (0, 1.5, 9, 0, 0.3)})
 

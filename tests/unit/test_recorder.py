@@ -103,6 +103,18 @@ def test_inputs_come_back_in_order_and_to_the_last_bit(flown: tuple[Path, Flight
                 assert entry.look == given.tick - 20
 
 
+def test_depth_comes_back_beside_its_own_keyframe_alone(tmp_path: Path) -> None:
+    random = np.random.default_rng(5)
+    plain = [keyframe(1, number, 10 * number, random=random) for number in range(6)]
+    taken = [one.model_copy(update={"depth": random.bytes(300)}) if one.sequence % 2 else one for one in plain]
+    with Recorder(tmp_path / "depth.mcap", team(1), lossless=True) as recorder:
+        for one in taken:
+            recorder.heard(topics.KEYFRAME, one, one.tick)
+    recording = Recording.open(tmp_path / "depth.mcap")
+    assert list(recording.keyframes()) == taken
+    assert (recording.counts()["/drone/1/depth"], recording.losses()) == (3, {})
+
+
 def test_what_people_see_comes_back_as_well(flown: tuple[Path, Flight]) -> None:
     path, flight = flown
     recording = Recording.open(path)

@@ -26,6 +26,7 @@ from protocol.traffic import (
     PHASE_PERIOD_S,
     Carrier,
     Plan,
+    default_depth_bytes,
     default_jpeg_bytes,
     keyframe_rate_hz,
     radio_bytes_per_s,
@@ -107,6 +108,18 @@ def test_images_travel_from_drones_that_have_cameras_or_where_a_size_is_given() 
     assert not image[2]
     (given,) = [f for f in traffic_of(team(2), 2, Plan(jpeg_bytes=50_000)).flows if f.topic == topics.KEYFRAME.key]
     assert 50_000 < given.message_bytes < 50_500
+
+
+def test_the_image_of_a_depth_camera_travels_with_it() -> None:
+    plain = team(1)
+    deep = plain.model_copy(update={"camera": Camera(depth=True)})
+    sizes = [
+        next(f for f in traffic_of(mission, 1, Plan(jpeg_bytes=20_000)).flows if f.topic == topics.KEYFRAME.key)
+        for mission in (plain, deep)
+    ]
+    grown = sizes[1].message_bytes - sizes[0].message_bytes
+    assert grown == pytest.approx(default_depth_bytes(deep), abs=8)
+    assert default_depth_bytes(plain) == 0
 
 
 # --- what it comes to ------------------------------------------------------------------------------------------------

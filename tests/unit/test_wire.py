@@ -21,10 +21,12 @@ from protocol.messages import (
     DroneState,
     DroneStatus,
     Event,
+    ExternalMesh,
     JournalPage,
     Jump,
     JumpHead,
     Keyframe,
+    KeyframePage,
     MeshBlock,
     MeshPage,
     MissionPhase,
@@ -117,6 +119,7 @@ EXAMPLES: tuple[Message, ...] = (
         cx=160.0,
         cy=90.0,
         jpeg=b"\xff\xd8\x00\xff\xd9",
+        depth=b"\x89PNG\x00",
     ),
     Jump(epoch=5, sequence=0, tick=140, increments=np.array([0.0, 0.5, -1.5], np.float32)),
     JumpHead(epoch=5, next_sequence=1, done=139, phase="flying"),
@@ -127,6 +130,15 @@ EXAMPLES: tuple[Message, ...] = (
     Event(source="drone/3", tick=12, level="warning", kind="order", text="land: battery critical (battery at 9%)"),
     MESH_BLOCK,
     MeshPage(epoch=7, revision=3, complete=False, blocks=(MESH_BLOCK,)),
+    KeyframePage(epoch=7, first=12, next=40, keyframes=(b"\x00one", b"two"), wanted=True),
+    ExternalMesh(
+        epoch=7,
+        taken=40,
+        vertices=MESH_BLOCK.vertices,
+        faces=MESH_BLOCK.faces,
+        colours=MESH_BLOCK.colours,
+        fault="none of it",
+    ),
     ROW,
     REPLICA,
     PhiDigest(epoch=5, tick=60, sketches=np.array([[0.5, 1.0], [0.25, 0.0]], np.float32)),
@@ -286,6 +298,14 @@ def test_an_older_minor_versions_message_takes_the_defaults_of_what_it_lacks(mon
     found = decode(DroneState, msgpack.packb(fields))
 
     assert (found.obeyed, found.blind_s) == (0, 0.0)
+
+
+def test_a_keyframe_of_a_release_without_depth_cameras_has_none() -> None:
+    (example,) = (message for message in EXAMPLES if isinstance(message, Keyframe))
+    fields = unpacked(example) | {"m": 1}
+    del fields["depth"]
+
+    assert decode(Keyframe, msgpack.packb(fields)) == example.model_copy(update={"depth": b""})
 
 
 @pytest.mark.parametrize("minor", [-1, True, 1.0, "1", None, [1]])
