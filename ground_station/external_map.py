@@ -1,7 +1,7 @@
 """The map of another process: gives it keyframes as it asks for them, and judges the meshes that it answers with.
 
 Between the event loop, on which the process is heard, and the map's thread, which waits for it in lockstep: never long,
-and not again before a process that was late has caught up. Nothing else of the mission depends on its answers.
+and not again before a process that was late has answered. Nothing else of the mission depends on its answers.
 """
 
 from __future__ import annotations
@@ -89,8 +89,9 @@ class ExternalMap:
                 self.refused += 1
             elif message.taken >= self._taken:
                 self._newest, self._taken = Mesh(message.vertices, message.faces, message.colours), message.taken
+            self._gave_up = False
             if message.taken >= self._asked:
-                self._wanted = self._gave_up = False
+                self._wanted = False
                 self._changed.notify_all()
         self._say(f"the external map is refused: {fault}" if fault else "")
 
@@ -142,7 +143,7 @@ class ExternalMap:
         what = "was late" if self._lives() else "is gone" if self._was_there else "has not come"
         waited = "" if what == "is gone" else f" in {self._patience_s:g} s"
         luck = ", and this run cannot be repeated" if self._lockstep else ""
-        self._say(f"the external map's process {what}{waited}: no map updates until it has caught up{luck}")
+        self._say(f"the external map's process {what}{waited}: no map updates until it answers{luck}")
 
     def _wake(self) -> None:
         if self._loop is not None:

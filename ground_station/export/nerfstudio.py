@@ -14,7 +14,7 @@ from ground_station.export.meshes import cloud_ply
 from ground_station.export.output import Exported, write_georeference
 from ground_station.export.source import Source
 from ground_station.export.sparse import sparse_points
-from ground_station.export.views import IMAGES_FOLDER, View, write_images
+from ground_station.export.views import DEPTHS_FOLDER, IMAGES_FOLDER, View, write_images
 from protocol.geometry import Floats, Intrinsics
 
 TRANSFORMS_FILE = "transforms.json"
@@ -41,7 +41,8 @@ def export_nerfstudio(source: Source, folder: Path, *, points: int) -> Exported:
 
 def transforms(views: tuple[View, ...], *, with_points: bool) -> dict[str, Any]:
     """The content of transforms.json. Poses are in the world frame, metres; intrinsics go by frame, as each drone has
-    a camera of its own."""
+    a camera of its own. Depth is spoken of where all images have it: nerfstudio refuses less."""
+    deep = all(view.depth for view in views)
     return {
         "camera_model": "PINHOLE",
         # nerfstudio would turn the world until the cameras' mean "up" is up; cameras that look down have none.
@@ -50,6 +51,7 @@ def transforms(views: tuple[View, ...], *, with_points: bool) -> dict[str, Any]:
         "frames": [
             {
                 "file_path": f"{IMAGES_FOLDER}/{view.name}",
+                **({"depth_file_path": f"{DEPTHS_FOLDER}/{view.depth}"} if deep else {}),
                 **_intrinsics(view.intrinsics),
                 "transform_matrix": camera_to_world(view).tolist(),
             }

@@ -19,6 +19,7 @@ from protocol.geometry import Floats, Intrinsics
 from protocol.messages import Keyframe
 
 IMAGES_FOLDER = "images"
+DEPTHS_FOLDER = "depths"
 
 _DRAFT = 8
 """JPEG decodes at an eighth of its size for a fraction of the time, and still needs all of its bytes."""
@@ -37,6 +38,8 @@ class View:
     rotation: Floats
     """(3, 3) camera to world; camera axes right, down, forward (`protocol.geometry`)."""
     intrinsics: Intrinsics
+    depth: str = ""
+    """Name of its depth image's file in the folder of those (`protocol.depth_image`); empty without one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +51,8 @@ class Views:
 
 
 def write_images(source: Source, folder: Path) -> Views:
-    """Write every image that can be read into ``folder``/images, byte for byte as the drone sent it.
+    """Write every image that can be read into ``folder``/images, and what depth cameras measured into
+    ``folder``/depths, byte for byte as the drone sent it.
 
     Keyframes that the map had no use for are among them: another method may have.
 
@@ -56,7 +60,7 @@ def write_images(source: Source, folder: Path) -> Views:
         CovreconError: there is none, or the source cannot be read.
         OSError: the disk refuses it.
     """
-    images = folder / IMAGES_FOLDER
+    images, depths = folder / IMAGES_FOLDER, folder / DEPTHS_FOLDER
     images.mkdir(exist_ok=True)
     views: list[View] = []
     refused: Counter[str] = Counter()
@@ -68,6 +72,9 @@ def write_images(source: Source, folder: Path) -> Views:
             refused[fault] += 1
             continue
         (images / view.name).write_bytes(keyframe.jpeg)
+        if view.depth:
+            depths.mkdir(exist_ok=True)
+            (depths / view.depth).write_bytes(keyframe.depth)
         seen.add(view.name)
         views.append(view)
     if not views:
@@ -76,13 +83,15 @@ def write_images(source: Source, folder: Path) -> Views:
 
 
 def _view(keyframe: Keyframe) -> View:
+    name = f"drone_{keyframe.drone}_{keyframe.sequence:06d}"
     return View(
-        name=f"drone_{keyframe.drone}_{keyframe.sequence:06d}.jpg",
+        name=f"{name}.jpg",
         drone=keyframe.drone,
         tick=keyframe.tick,
         position=np.array(keyframe.position),
         rotation=np.array(keyframe.rotation),
         intrinsics=Intrinsics(keyframe.width, keyframe.height, keyframe.fx, keyframe.fy, keyframe.cx, keyframe.cy),
+        depth=f"{name}.png" if keyframe.depth else "",
     )
 
 

@@ -16,6 +16,7 @@ from faults.flown import CAMERAS, HEIGHT, MARK, ORIGIN, WIDTH, Flown, a_flight, 
 from ground_station.export.colmap import export_colmap
 from ground_station.export.nerfstudio import export_nerfstudio
 from ground_station.export.source import Source, open_source
+from protocol.depth_image import encode_depth
 from protocol.errors import CovreconError
 
 SPOT_ERROR_PX = 0.1
@@ -183,3 +184,20 @@ def test_a_run_without_a_map_is_exported_without_points(flown: Flown, tmp_path: 
     folder.mkdir()
     export_colmap(source, folder, points=POINTS)
     assert not pycolmap.Reconstruction(folder / "sparse/0").points3D
+
+
+def test_what_depth_cameras_measured_is_exported_in_millimetres_where_all_images_have_it(tmp_path: Path) -> None:
+    flown = a_flight(ORIGIN)
+    depth = encode_depth(np.full((HEIGHT // 2, WIDTH // 2), 1.25, np.float32))
+    deep = tuple(one.model_copy(update={"depth": depth}) for one in flown.keyframes)
+    for name, keyframes in (("all", deep), ("some", (*deep[:-1], flown.keyframes[-1]))):
+        (tmp_path / name).mkdir()
+        run = write_folder(dataclasses.replace(flown, keyframes=keyframes), tmp_path / name)
+        folder = tmp_path / f"{name}-scene"
+        folder.mkdir()
+        export_nerfstudio(open_source(run), folder, points=POINTS)
+        found = [frame.get("depth_file_path", "") for frame in frames(folder)]
+        assert all(found) if name == "all" else not any(found)
+        if name == "all":
+            with Image.open(folder / found[0]) as image:
+                assert np.asarray(image).tolist() == np.full((HEIGHT // 2, WIDTH // 2), 1250).tolist()

@@ -135,16 +135,14 @@ def test_in_lockstep_the_map_of_all_keyframes_is_waited_for(station: Station) ->
     assert station.said == []
 
 
-def test_a_process_that_is_late_is_waited_for_once_until_it_has_caught_up(station: Station) -> None:
+def test_a_process_that_is_late_is_waited_for_once_until_it_answers(station: Station) -> None:
     end = station.take(*FLIGHT[:3])
     began = time.monotonic()
     for _ in range(50):
         assert station.map.mesh_of(end)[1] == 0
     assert time.monotonic() - began < 10 * PATIENCE_S
     assert [level for level, _ in station.said] == ["warning"]
-    assert "was late in 0.3 s: no map updates until it has caught up, and this run cannot be repeated" in str(
-        station.said
-    )
+    assert "was late in 0.3 s: no map updates until it answers, and this run cannot be repeated" in str(station.said)
     station.map.hear(mesh(end))
     assert station.said[1:] == [("info", "the external map's process answers")]
     assert station.map.mesh_of(end)[1] == end
