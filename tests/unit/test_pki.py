@@ -180,11 +180,17 @@ def test_who_has_a_valid_certificate_is_not_given_a_second(fleet: Path) -> None:
 def test_only_parties_of_a_fleet_are_issued_certificates(fleet: Path) -> None:
     for identity in ("drone-0", "drone-3.1", "ca", "../x", "operator-Anna"):
         message = refusal(lambda identity=identity: issue(fleet, [identity], now=NOW))  # type: ignore[misc]
-        assert message.startswith(f"{identity!r} cannot have a certificate; there are router, ground, sim, drone-1 to")
+        assert message.startswith(
+            f"{identity!r} cannot have a certificate; there are router, ground, sim, mapper, drone-1 to"
+        )
 
 
 def test_a_name_given_twice_is_issued_once(fleet: Path) -> None:
     assert names(issue(fleet, ["drone-7", "drone-7"], now=NOW)) == ["drone-7.1"]
+
+
+def test_a_process_that_makes_the_map_may_have_a_certificate(fleet: Path) -> None:
+    assert names(issue(fleet, ["mapper"], now=NOW)) == ["mapper.1"]
 
 
 def test_only_a_router_has_hosts_and_needs_some(fleet: Path) -> None:

@@ -41,7 +41,7 @@ def test_a_value_that_it_has_already_changes_nothing() -> None:
         ("feedback.kapa=0.5", "feedback.kapa: unknown key, did you mean kappa?"),
         ("feedback.kappa=0", "feedback.kappa: must be greater than 0, got 0"),
         ("feedback.kappa=high", 'feedback.kappa: must be a valid number, got "high"'),
-        ("reconstruction.backend=nerf", "reconstruction.backend: must be 'plane_sweep' or 'none', got \"nerf\""),
+        ("feedback.method=nerf", "feedback.method: must be 'grid', 'm3c2' or 'none', got \"nerf\""),
         (
             "feedback.cylinder.radius_m=0.1",
             "feedback.cylinder: half_length_m 0.25 must be an odd multiple of radius_m 0.1",
