@@ -17,7 +17,7 @@ from protocol.geometry import Intrinsics
 from protocol.operation_settings import Console, Metrics, Recording
 from protocol.planner_settings import PlannerName, Planners, planner_faults
 from protocol.separation import widened_separation
-from protocol.settings import Angle, Metres, NonNegative, Positive, Settings, Vector
+from protocol.settings import Angle, Metres, NonNegative, Positive, Settings, Share, Vector
 from protocol.transport_settings import Transport
 from protocol.vehicle_settings import Autopilot, Vehicles
 
@@ -258,6 +258,9 @@ class Simulation(Settings):
     scene: str = "living_room"
     """A built-in scene's name, or the path of a glb, gltf, obj, ply or stl file or of a folder that holds one, relative
     to the mission file; empty for a flight without images."""
+    texture_contrast: Share = 1.0
+    """Factor on how far each texture's texels differ from its mean colour: 1 as drawn, 0 plain colours under the same
+    light."""
     image_noise: NonNegative = 2.0
     """Standard deviation of the camera's noise, in grey levels of 255."""
     depth_noise_m: NonNegative = 0.002

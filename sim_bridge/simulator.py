@@ -195,7 +195,14 @@ def _make_photographer(mission: Mission, run: Path) -> Photographer | None:
     from sim_bridge.scenes.truth import write_truth
 
     cache = scene_cache()
-    scene = load_scene(mission.simulation.scene, relative_to=run, cache=cache, on_progress=log.info)
+    simulation = mission.simulation
+    scene = load_scene(
+        simulation.scene,
+        relative_to=run,
+        cache=cache,
+        texture_contrast=simulation.texture_contrast,
+        on_progress=log.info,
+    )
     write_truth(scene, mission, run, cache=cache)
     camera = Camera(scene, mission.camera.intrinsics())
     camera.render(mission.drones[0].start)

@@ -10,6 +10,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from protocol.errors import SceneError
 from sim_bridge.scenes.surfaces import Surfaces
-from sim_bridge.scenes.texture_set import TextureSet, build_texture_set
+from sim_bridge.scenes.texture_set import TextureSet, build_texture_set, with_contrast
 
 log = logging.getLogger(__name__)
 
@@ -51,37 +52,60 @@ class Scene:
     """sha256 of the content, hexadecimal."""
 
 
+Maker = Callable[[], tuple[Surfaces, list[NDArray[np.uint8]]]]
+"""Makes surfaces without light, and the images that they use."""
+
+
 def _quiet(_: str) -> None:
     pass
 
 
-def load_scene(spec: str, *, relative_to: Path, cache: Path, on_progress: Callable[[str], None] = _quiet) -> Scene:
+def load_scene(
+    spec: str,
+    *,
+    relative_to: Path,
+    cache: Path,
+    texture_contrast: float = 1.0,
+    on_progress: Callable[[str], None] = _quiet,
+) -> Scene:
     """The scene called ``spec``: a built-in name, ``room-<seed>``, or the path of a mesh file or of a folder with one.
 
     Paths are taken relative to ``relative_to``. A scene is built on first use and kept under ``cache``;
-    ``on_progress`` is told what takes time. Files are read as z-up metres (`sim_bridge.scenes.mesh_file`).
+    ``texture_contrast`` is the mission's `simulation.texture_contrast`; ``on_progress`` is told what takes time. Files
+    are read as z-up metres (`sim_bridge.scenes.mesh_file`).
 
     Raises `SceneError`, naming the file, where nothing can be shown.
     """
+    make, name, key = _source(spec, relative_to, on_progress)
+    if texture_contrast != 1.0:
+        key = hashlib.sha256(f"{key} {texture_contrast!r}".encode()).hexdigest()
+
+    def generate() -> tuple[Surfaces, list[NDArray[np.uint8]]]:
+        surfaces, images = make()
+        return surfaces, [with_contrast(image, texture_contrast) for image in images]
+
+    return _cached(cache / f"{name}-{key[:16]}.npz", generate, spec, on_progress)
+
+
+def _source(spec: str, relative_to: Path, on_progress: Callable[[str], None]) -> tuple[Maker, str, str]:
+    """What makes the scene, the name of its file in the cache, and a key of all that its bytes depend on."""
     if spec in BUILT_IN:
         from sim_bridge.scenes.living_room import living_room
 
-        key = source_digest(*_BAKERY, "living_room", "furniture", "textures")
-        return _cached(cache / f"{spec}-{key[:16]}.npz", living_room, spec, on_progress)
+        return living_room, spec, source_digest(*_BAKERY, "living_room", "furniture", "textures")
     seed = seed_of(spec)
     if seed is not None:
         from sim_bridge.scenes.random_room import random_room
 
         key = source_digest(*_BAKERY, "random_room", "arrangement", "living_room", "furniture", "textures")
-        return _cached(cache / f"{spec}-{key[:16]}.npz", lambda: random_room(seed), spec, on_progress)
+        return partial(random_room, seed), spec, key
     from sim_bridge.scenes.mesh_file import find_mesh, read_mesh
 
     path = find_mesh(spec, relative_to)
     on_progress(f"reading {path.name}")
     surfaces, images = read_mesh(path)
     content = _digest([*(getattr(surfaces, field.name) for field in fields(surfaces)), *images])
-    key = hashlib.sha256((source_digest(*_BAKERY) + content).encode()).hexdigest()
-    return _cached(cache / f"file-{key[:16]}.npz", lambda: (surfaces, images), path.name, on_progress)
+    return lambda: (surfaces, images), "file", hashlib.sha256((source_digest(*_BAKERY) + content).encode()).hexdigest()
 
 
 def seed_of(spec: str) -> int | None:
@@ -134,7 +158,7 @@ def _curve_order(centres: NDArray[np.float64]) -> NDArray[np.int64]:
 
 def _cached(
     path: Path,
-    generate: Callable[[], tuple[Surfaces, list[NDArray[np.uint8]]]],
+    generate: Maker,
     name: str,
     on_progress: Callable[[str], None],
 ) -> Scene:

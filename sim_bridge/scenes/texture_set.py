@@ -30,6 +30,15 @@ class TextureSet:
     """[K, 3]: width, height and number of levels; level l is ``max(1, width >> l) x max(1, height >> l)``."""
 
 
+def with_contrast(image: NDArray[np.uint8], contrast: float) -> NDArray[np.uint8]:
+    """The image [H, W, 3] with each texel's difference from its mean colour times ``contrast``; 1 leaves it alone."""
+    if contrast == 1.0:
+        return image
+    mean = image.mean(axis=(0, 1))
+    flattened: NDArray[np.uint8] = np.clip(np.rint(mean + contrast * (image - mean)), 0, 255).astype(np.uint8)
+    return flattened
+
+
 def build_texture_set(images: Sequence[NDArray[np.uint8]]) -> TextureSet:
     """Pack images [H, W, 3] (any size) with their mip levels (box filter)."""
     texels: list[NDArray[np.uint32]] = []

@@ -14,7 +14,7 @@ from sim_bridge.scenes.lighting import bake
 from sim_bridge.scenes.living_room import living_room
 from sim_bridge.scenes.scene import build_scene, load_scene
 from sim_bridge.scenes.surfaces import Material, Surfaces, box, cushion, join, lathe, quad, rod
-from sim_bridge.scenes.texture_set import build_texture_set
+from sim_bridge.scenes.texture_set import build_texture_set, with_contrast
 
 INTRINSICS = Intrinsics.from_field_of_view(160, 90, math.radians(73.7))
 FROM_ABOVE = (0.0, 0.0, 3.0, math.pi / 2, math.pi / 2)
@@ -185,6 +185,32 @@ def test_a_changed_file_is_another_scene(tmp_path: Path) -> None:
     before = load_scene("cube.ply", relative_to=tmp_path, cache=cache)
     write_cube(tmp_path / "cube.ply", (10, 200, 40, 255))
     assert load_scene("cube.ply", relative_to=tmp_path, cache=cache).fingerprint != before.fingerprint
+
+
+def test_texture_contrast_flattens_towards_the_mean_colour() -> None:
+    image = np.random.default_rng(0).integers(40, 200, (64, 64, 3)).astype(np.uint8)
+    assert with_contrast(image, 1.0) is image
+    quarter = with_contrast(image, 0.25)
+    assert quarter.std(axis=(0, 1)) == pytest.approx(0.25 * image.std(axis=(0, 1)), rel=0.02)
+    assert quarter.mean(axis=(0, 1)) == pytest.approx(image.mean(axis=(0, 1)), abs=0.5)
+    assert (np.ptp(with_contrast(image, 0.0), axis=(0, 1)) == 0).all()
+
+
+def test_texture_contrast_makes_another_scene_of_the_same_shape_that_is_cached_beside_the_first(tmp_path: Path) -> None:
+    checks = (np.indices((8, 8)).sum(axis=0) % 2 * 200).astype(np.uint8)
+    Image.fromarray(checks[..., None].repeat(3, axis=2)).save(tmp_path / "paint.png")
+    (tmp_path / "tile.mtl").write_text("newmtl paint\nmap_Kd paint.png\n")
+    corners = "v -2 -2 0\nv 2 -2 0\nv 2 2 0\nv -2 2 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+    (tmp_path / "tile.obj").write_text(f"mtllib tile.mtl\n{corners}usemtl paint\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n")
+    cache = tmp_path / "cache"
+    scenes = [
+        load_scene("tile.obj", relative_to=tmp_path, cache=cache, texture_contrast=contrast)
+        for contrast in (1.0, 0.5, 0.0, 0.5)
+    ]
+    assert len({scene.fingerprint for scene in scenes}) == len(list(cache.iterdir())) == 3
+    assert scenes[1].fingerprint == scenes[3].fingerprint
+    assert all(np.array_equal(scene.light, scenes[0].light) for scene in scenes)
+    assert [int(np.ptp(scene.textures.texels[:64] & 255)) for scene in scenes] == [200, 100, 0, 100]
 
 
 def test_building_twice_gives_the_same_bytes() -> None:
