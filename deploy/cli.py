@@ -18,6 +18,7 @@ from cyclopts.validators import Number
 from deploy.bench_command import bench_app
 from deploy.completion_command import completion_of
 from deploy.doctor_command import doctor
+from deploy.evaluate_command import evaluate
 from deploy.export_command import export_app
 from deploy.pki_command import pki_app
 from deploy.recording_command import recording_app
@@ -47,6 +48,7 @@ app.command(export_app)
 app.command(pki_app)
 app.command(bench_app)
 app.command(replay)
+app.command(evaluate)
 app.command(doctor)
 app.command(traffic)
 app.command(completion_of(app), name="completion")

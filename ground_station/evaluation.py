@@ -40,6 +40,9 @@ CELL_THRESHOLDS = 2.0
 CELLS_PER_AXIS = 128
 """Bounds the memory of the search cells in a large box."""
 
+NO_THING = -1
+"""Number of what is part of no furniture: floor, walls, and all of a scene whose parts are not known."""
+
 Vertices: TypeAlias = NDArray[np.float32]
 Faces: TypeAlias = NDArray[np.int32]
 Mask: TypeAlias = NDArray[np.bool_]
@@ -81,35 +84,68 @@ class Truth:
     """(N,)"""
     tree: cKDTree
     """Of ``points``."""
+    thing: NDArray[np.int32]
+    """(N,) which of ``names`` it is part of, or `NO_THING`."""
+    names: tuple[str, ...]
+    """Of the scene's furniture."""
+    box: Box | None
+    """In which the scene's surface was sampled, if the file says it."""
 
     @classmethod
-    def of(cls, points: Vertices, exposed: Mask, visible: Mask) -> Self:
+    def of(
+        cls,
+        points: Vertices,
+        exposed: Mask,
+        visible: Mask,
+        *,
+        thing: NDArray[np.int32] | None = None,
+        names: tuple[str, ...] = (),
+        box: Box | None = None,
+    ) -> Self:
         """From all samples, hidden ones too; points that are not exposed can be on no map and are left out."""
+        if thing is None:
+            thing = np.full(len(points), NO_THING, np.int32)
         kept = np.ascontiguousarray(points[exposed], dtype=np.float32)
         # An unbalanced tree is built in half the time and answers as fast on evenly spread points.
-        return cls(kept, visible[exposed], cKDTree(kept, balanced_tree=False, compact_nodes=False))
+        tree = cKDTree(kept, balanced_tree=False, compact_nodes=False)
+        return cls(kept, visible[exposed], tree, thing[exposed], names, box)
 
 
 def load_truth(run: Path) -> Truth | None:
     """The truth that the simulator wrote into the run's folder; None if it wrote none, as in a real flight.
 
-    The file holds ``points`` float32 (N, 3), ``exposed`` and ``visible`` bool (N,). Raises SceneError, with the
-    file's path, if it cannot be read or its arrays do not fit together.
+    Raises SceneError as `read_truth` does.
     """
     path = run / TRUTH_FILE
-    if not path.exists():
-        return None
+    return read_truth(path) if path.exists() else None
+
+
+def read_truth(path: Path) -> Truth:
+    """The file holds ``points`` float32 (N, 3), ``exposed`` and ``visible`` bool (N,); since 0.2 also ``thing`` int32
+    (N,), ``names`` and ``box`` (2, 3).
+
+    Raises SceneError, with the file's path, if it cannot be read or its arrays do not fit together.
+    """
     try:
         with path.open("rb") as stream, np.load(stream) as file:
             points, exposed, visible = file["points"], file["exposed"], file["visible"]
+            thing = file["thing"] if "thing" in file else np.full(len(points), NO_THING, np.int32)
+            names = tuple(map(str, file["names"])) if "names" in file else ()
+            ends = file.get("box")
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise SceneError(f"{path}: {error}") from error
     count = len(points)
-    if points.shape != (count, 3) or exposed.shape != (count,) or visible.shape != (count,):
-        raise SceneError(f"{path}: shapes do not fit: {points.shape}, {exposed.shape}, {visible.shape}")
+    if points.shape != (count, 3) or any(array.shape != (count,) for array in (exposed, visible, thing)):
+        raise SceneError(f"{path}: shapes do not fit: {points.shape}, {exposed.shape}, {visible.shape}, {thing.shape}")
     if exposed.dtype != np.bool_ or visible.dtype != np.bool_ or not np.isfinite(points).all():
         raise SceneError(f"{path}: points must be finite, exposed and visible bool")
-    return Truth.of(points, exposed, visible)
+    if thing.dtype != np.int32 or not np.isin(thing, np.arange(NO_THING, len(names))).all():
+        raise SceneError(f"{path}: thing must be int32, each the number of one of {len(names)} names or {NO_THING}")
+    try:
+        box = None if ends is None else Box(lower_m=tuple(ends[0].tolist()), upper_m=tuple(ends[1].tolist()))
+    except (ValueError, IndexError, AttributeError) as error:
+        raise SceneError(f"{path}: box: {error}") from error
+    return Truth.of(points, exposed, visible, thing=thing, names=names, box=box)
 
 
 def score(
@@ -133,7 +169,7 @@ def score(
     lower, upper = np.array(box.lower_m), np.array(box.upper_m)
     object_mesh_z, object_truth_z = lower[2] + OBJECT_MESH_M, lower[2] + OBJECT_TRUTH_M
 
-    drawn = _sample_surface(vertices, faces, samples, rng)
+    drawn = sample_surface(vertices, faces, samples, rng)
     drawn = drawn[np.all((drawn >= lower - threshold_m) & (drawn <= upper + threshold_m), axis=1)]
     distances, _ = truth.tree.query(drawn, distance_upper_bound=threshold_m)
     right = np.isfinite(distances)
@@ -143,7 +179,7 @@ def score(
     points, visible = truth.points[kept], truth.visible[kept]
     inside = np.all((points >= lower) & (points <= upper), axis=1)
     points, visible = points[inside], visible[inside]
-    near_any = _near_surface(points, vertices, faces, threshold_m)
+    near_any = near_surface(points, vertices, faces, threshold_m)
     objects = points[visible & (points[:, 2] > object_truth_z)]
     object_faces = faces[(vertices[:, 2] > object_mesh_z)[faces].any(axis=1)]
 
@@ -153,7 +189,7 @@ def score(
         exposed=Score.of(precision, _share(near_any)),
         objects=Score.of(
             _share(right[drawn[:, 2] > object_mesh_z]),
-            _share(_near_surface(objects, vertices, object_faces, threshold_m)),
+            _share(near_surface(objects, vertices, object_faces, threshold_m)),
         ),
     )
 
@@ -169,7 +205,7 @@ def _share(mask: Mask) -> float:
     return float(np.count_nonzero(mask)) / mask.size if mask.size else 0.0
 
 
-def _sample_surface(vertices: Vertices, faces: Faces, count: int, rng: np.random.Generator) -> Floats:
+def sample_surface(vertices: Vertices, faces: Faces, count: int, rng: np.random.Generator) -> Floats:
     """(count, 3) points spread by area, or (0, 3) if there is none.
 
     Systematic: equal steps along the cumulated area. Neighbouring triangles follow each other in a mesh, so the
@@ -202,7 +238,7 @@ def _cumulated_area(vertices: Vertices, faces: Faces) -> Floats:
 
 
 @njit(cache=True, nogil=True)
-def _near_surface(points: Vertices, vertices: Vertices, faces: Faces, threshold_m: float) -> Mask:
+def near_surface(points: Vertices, vertices: Vertices, faces: Faces, threshold_m: float) -> Mask:
     """Which points (N, 3) lie within the threshold of any triangle; exact.
 
     Triangles visit the points in the cells around them, and a point that is settled leaves its cell. That needs no

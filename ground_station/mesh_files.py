@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -75,6 +76,28 @@ def read_glb(content: bytes, name: str) -> Mesh:
     encoded = np.where(level <= 0.0031308, level * 12.92, 1.055 * level ** (1 / 2.4) - 0.055)  # IEC 61966-2-1
     shown = np.round(255 * encoded).astype(np.uint8)[found.colors]
     return Mesh(np.column_stack([x, -back, up]), found.faces, shown)
+
+
+def read_geometry(path: Path) -> tuple[Vertices, Faces]:
+    """Vertices (V, 3) and faces (F, 3) of any program's mesh file, in z-up metres; glTF, which is y-up, is turned.
+
+    Raises:
+        CovreconError: it is no mesh with triangles, or cannot be read.
+    """
+    import trimesh
+
+    if not path.is_file():
+        raise CovreconError(f"{path}: no such mesh file")
+    try:
+        mesh = trimesh.load_scene(path, process=False).to_mesh()
+        vertices, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32).reshape(-1, 3)
+    except Exception as error:  # trimesh's parsers raise whatever their input makes them raise
+        raise CovreconError(f"{path}: cannot be read as a mesh: {type(error).__name__}: {error}") from error
+    if not len(faces) or not np.isfinite(vertices).all():
+        raise CovreconError(f"{path}: no mesh of finite triangles")
+    if path.suffix.lower() in (".glb", ".gltf"):
+        vertices = np.column_stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]])
+    return np.ascontiguousarray(vertices), np.ascontiguousarray(faces)
 
 
 def _read(content: bytes, name: str, file_type: str) -> Mesh:

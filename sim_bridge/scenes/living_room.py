@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sim_bridge.scenes import furniture as f
+from sim_bridge.scenes.arrangement import Piece, piece
 from sim_bridge.scenes.surfaces import Material, Surfaces, box, join, quad
 from sim_bridge.scenes.textures import TEXTURE, Image, draw_textures
 
@@ -24,9 +25,14 @@ OUTSIDE_M = 14.0
 
 def living_room() -> tuple[Surfaces, list[Image]]:
     """Surfaces without light, and the images that they use."""
+    walls = shell(f.material("wallpaper", 2.0), _pictures())
+    return join([walls, *(each.surfaces for each in furnish())]), draw_textures(SEED)
+
+
+def furnish() -> list[Piece]:
+    """All furniture at its place."""
     rng = np.random.default_rng(SEED)
-    parts = [shell(f.material("wallpaper", 2.0), _pictures()), _sitting_area(rng), _dining_area(), _edges(rng)]
-    return join(parts), draw_textures(SEED)
+    return [*_sitting_area(rng), *_dining_area(), *_edges(rng)]
 
 
 def shell(wall: Material, pictures: Sequence[Surfaces]) -> Surfaces:
@@ -57,7 +63,7 @@ def _pictures() -> list[Surfaces]:
     return walls
 
 
-def _sitting_area(rng: np.random.Generator) -> Surfaces:
+def _sitting_area(rng: np.random.Generator) -> list[Piece]:
     blue, ochre = f.material("blue_cloth", 0.5), f.material("ochre_cloth", 0.5)
     zigzag, tartan = f.material("zigzag", 0.45), f.material("tartan", 0.6)
     rug = box((2.6, 1.9, 0.012), f.material("linen", 0.3), without="zZ")
@@ -78,29 +84,31 @@ def _sitting_area(rng: np.random.Generator) -> Surfaces:
         f.vase(f.material("glaze", 0.3)).moved(0.36, 0.12, 0.42),
         f.bowl_of_fruit(f.material("painted", 0.3)).moved(0.05, -0.08, 0.42),
     ])  # fmt: skip
-    return join([
-        join([rug, pile]).moved(-1.1, 0.4, 0, 86),
-        sofa.moved(-2.45, 0.5, 0, -90),
-        coffee_table.moved(-1.15, 0.45, 0.0, 84),
-        armchair.moved(-0.95, -1.45, 0, 12),
-        f.sofa(1, f.material("tartan", 0.7)).moved(-0.7, 2.25, 0, 168),
-    ])  # fmt: skip
+    return [
+        piece("rug", join([rug, pile])).moved(-1.1, 0.4, 86),
+        piece("sofa", sofa).moved(-2.45, 0.5, -90),
+        piece("coffee table", coffee_table).moved(-1.15, 0.45, 84),
+        piece("armchair", armchair).moved(-0.95, -1.45, 12),
+        piece("armchair", f.sofa(1, f.material("tartan", 0.7))).moved(-0.7, 2.25, 168),
+    ]
 
 
-def _dining_area() -> Surfaces:
+def _dining_area() -> list[Piece]:
     cherry, cloth = f.material("cherry", 1.1), f.material("blue_cloth", 0.4)
     glaze = f.material("glaze", 0.25)
     runner = box((1.3, 0.34, 0.004), f.material("zigzag", 0.5), (0, 0, 0.75), without="z")
-    parts = [f.table(1.6, 0.9, 0.75, cherry), runner, f.vase(f.material("clay", 0.3)).moved(0.05, 0.02, 0.754)]
+    laid = [f.table(1.6, 0.9, 0.75, cherry), runner, f.vase(f.material("clay", 0.3)).moved(0.05, 0.02, 0.754)]
+    chairs = []
     for x in (-0.45, 0.45):
         for side, yaw in ((-1, 0), (1, 180)):
-            parts.append(f.chair(f.material("cherry", 0.7), cloth).moved(yaw_deg=yaw + 9 * x).moved(x, side * 0.62))
-            parts.append(f.plate(glaze).moved(x * 1.05, side * 0.3, 0.75))
-    parts.append(f.stack_of_books(3, np.random.default_rng(SEED + 1)).moved(-0.62, 0.02, 0.754, 70))
-    return join(parts).moved(1.35, -0.9, 0, 78)
+            chair = f.chair(f.material("cherry", 0.7), cloth).moved(yaw_deg=yaw + 9 * x).moved(x, side * 0.62)
+            chairs.append(piece("chair", chair))
+            laid.append(f.plate(glaze).moved(x * 1.05, side * 0.3, 0.75))
+    laid.append(f.stack_of_books(3, np.random.default_rng(SEED + 1)).moved(-0.62, 0.02, 0.754, 70))
+    return [each.moved(1.35, -0.9, 78) for each in (piece("dining table", join(laid)), *chairs)]
 
 
-def _edges(rng: np.random.Generator) -> Surfaces:
+def _edges(rng: np.random.Generator) -> list[Piece]:
     walnut, birch, painted = f.material("walnut", 0.9), f.material("birch", 0.9), f.material("painted", 0.7)
     sideboard = join([
         f.sideboard(1.7, 0.42, 0.62, birch, painted),
@@ -113,11 +121,11 @@ def _edges(rng: np.random.Generator) -> Surfaces:
         f.parcel((0.4, 0.35, 0.3)).moved(0.04, 0.02, 0.42, -20),
         f.parcel((0.38, 0.5, 0.28)).moved(-0.62, 0.1, 0, 40),
     ])  # fmt: skip
-    return join([
-        f.wardrobe(1.3, 0.58, 1.92, walnut, painted).moved(2.62, 1.75, 0, 90),
-        f.bookshelf(1.5, 0.3, 1.85, walnut, rng).moved(0.9, 2.78, 0, 180),
-        sideboard.moved(-1.4, -2.72, 0, 0),
-        parcels.moved(1.4, 1.2),
-        f.floor_lamp().moved(-2.55, 2.3),
-        f.plant(rng).moved(2.45, -2.5),
-    ])  # fmt: skip
+    return [
+        piece("wardrobe", f.wardrobe(1.3, 0.58, 1.92, walnut, painted)).moved(2.62, 1.75, 90),
+        piece("bookshelf", f.bookshelf(1.5, 0.3, 1.85, walnut, rng)).moved(0.9, 2.78, 180),
+        piece("sideboard", sideboard).moved(-1.4, -2.72),
+        piece("parcels", parcels).moved(1.4, 1.2),
+        piece("lamp", f.floor_lamp()).moved(-2.55, 2.3),
+        piece("plant", f.plant(rng)).moved(2.45, -2.5),
+    ]

@@ -31,10 +31,19 @@ _Make = Callable[[np.random.Generator], list[Piece]]
 
 def random_room(seed: int) -> tuple[Surfaces, list[Image]]:
     """Surfaces without light, and the images that they use."""
+    walls, furniture = _room(seed)
+    return join([walls, *(placed.surfaces for placed in furniture)]), draw_textures(seed)
+
+
+def furniture_of(seed: int) -> list[Piece]:
+    """What stands in the room, as `furnish` says."""
+    return _room(seed)[1]
+
+
+def _room(seed: int) -> tuple[Surfaces, list[Piece]]:
     rng = np.random.default_rng(seed)
-    parts = [shell(f.material(_one_of(rng, WALLS), float(rng.uniform(1.2, 2.2))), _pictures(rng))]
-    parts += [placed.surfaces for placed in furnish(rng)]
-    return join(parts), draw_textures(seed)
+    walls = shell(f.material(_one_of(rng, WALLS), float(rng.uniform(1.2, 2.2))), _pictures(rng))
+    return walls, furnish(rng)
 
 
 def furnish(rng: np.random.Generator) -> list[Piece]:

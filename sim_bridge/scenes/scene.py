@@ -92,7 +92,7 @@ def _source(spec: str, relative_to: Path, on_progress: Callable[[str], None]) ->
     if spec in BUILT_IN:
         from sim_bridge.scenes.living_room import living_room
 
-        return living_room, spec, source_digest(*_BAKERY, "living_room", "furniture", "textures")
+        return living_room, spec, source_digest(*_BAKERY, "living_room", "arrangement", "furniture", "textures")
     seed = seed_of(spec)
     if seed is not None:
         from sim_bridge.scenes.random_room import random_room

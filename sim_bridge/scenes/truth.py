@@ -22,6 +22,7 @@ from protocol.mission import Mission
 from sim_bridge.scenes.cropping import crop_to_box
 from sim_bridge.scenes.ply import write_ply
 from sim_bridge.scenes.scene import Scene, replace_file, source_digest
+from sim_bridge.scenes.things import thing_at, things_of
 from sim_bridge.scenes.visibility import exposed_points, visible_points
 
 log = logging.getLogger(__name__)
@@ -45,10 +46,14 @@ class Truth:
     """[N] seen from some point in the open."""
     visible: NDArray[np.bool_]
     """[N] seen from a pose that the mission allows; implies exposed."""
+    thing: NDArray[np.int32]
+    """[N] which of ``names`` it is part of, or `sim_bridge.scenes.things.NO_THING`."""
+    names: tuple[str, ...]
 
 
 def write_truth(scene: Scene, mission: Mission, folder: Path, *, cache: Path) -> Truth:
-    """Write ``truth.ply`` (the mesh inside B, coloured) and ``truth_samples.npz`` (the fields of `Truth`).
+    """Write ``truth.ply`` (the mesh inside B, coloured) and ``truth_samples.npz`` (the fields of `Truth`, and ``box``,
+    B's two corners [2, 3]).
 
     The samples are kept under ``cache``, by the scene and the mission values they depend on. Raises `SceneError`
     if no surface lies inside B.
@@ -64,8 +69,8 @@ def write_truth(scene: Scene, mission: Mission, folder: Path, *, cache: Path) ->
     truth = _read(kept) if kept.exists() else None
     if truth is None:
         truth = _sample(scene, mission, corners, source)
-        _write(kept, truth)
-    _write(folder / SAMPLES_FILE, truth)
+        _write(kept, truth, mission)
+    _write(folder / SAMPLES_FILE, truth, mission)
     floor = truth.points[:, 2] < mission.target.lower_m[2] + FLOOR_M
     for name, seen in (("exposed", truth.exposed), ("visible", truth.visible)):
         share = float(floor[seen].mean()) if seen.any() else 0.0
@@ -89,7 +94,8 @@ def _sample(scene: Scene, mission: Mission, corners: Floats, source: NDArray[np.
     exposed = exposed_points(scene, mission.target, points, source[row])
     visible = np.zeros(count, dtype=np.bool_)
     visible[exposed] = visible_points(scene, mission, points[exposed], source[row][exposed])
-    return Truth(points, exposed, visible)
+    things = things_of(mission.simulation.scene)
+    return Truth(points, exposed, visible, thing_at(points, things), tuple(thing.name for thing in things))
 
 
 def _colours(scene: Scene, weights: Floats, source: NDArray[np.int64]) -> NDArray[np.uint8]:
@@ -116,7 +122,7 @@ def _key(scene: Scene, mission: Mission) -> str:
     flight, camera = mission.flight, mission.camera
     values = [
         scene.fingerprint,
-        source_digest("truth", "visibility", "cropping"),
+        source_digest("truth", "visibility", "cropping", "things"),
         (mission.target.lower_m, mission.target.upper_m),
         (flight.lower_m, flight.upper_m, flight.pitch_limits_rad),
         (camera.horizontal_fov_rad, camera.height_px / camera.width_px),
@@ -127,12 +133,21 @@ def _key(scene: Scene, mission: Mission) -> str:
 def _read(path: Path) -> Truth | None:
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
-            return Truth(data["points"], data["exposed"], data["visible"])
+            names = tuple(data["names"].tolist())
+            return Truth(data["points"], data["exposed"], data["visible"], data["thing"], names)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         log.warning("%s is damaged (%s): sampling the truth again", path, error)
         return None
 
 
-def _write(path: Path, truth: Truth) -> None:
+def _write(path: Path, truth: Truth, mission: Mission) -> None:
     with replace_file(path) as file:
-        np.savez(file, points=truth.points, exposed=truth.exposed, visible=truth.visible)
+        np.savez(
+            file,
+            points=truth.points,
+            exposed=truth.exposed,
+            visible=truth.visible,
+            thing=truth.thing,
+            names=np.array(truth.names, dtype=np.str_),
+            box=np.array([mission.target.lower_m, mission.target.upper_m]),
+        )

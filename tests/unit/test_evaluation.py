@@ -13,12 +13,13 @@ from hypothesis import strategies as st
 
 from ground_station.evaluation import (
     LIVE_SAMPLES,
+    NO_THING,
     Scores,
     Truth,
-    _near_surface,
-    _sample_surface,
     floor_baseline,
     load_truth,
+    near_surface,
+    sample_surface,
     score,
 )
 from protocol.errors import SceneError
@@ -59,7 +60,7 @@ def table(edge: float = 0.03, height: float = 0.6) -> Mesh:
 
 
 def truth_of(mesh: Mesh, count: int = 60_000) -> Truth:
-    points = _sample_surface(*mesh, count, np.random.default_rng(7)).astype(np.float32)
+    points = sample_surface(*mesh, count, np.random.default_rng(7)).astype(np.float32)
     everything = np.ones(count, bool)
     return Truth.of(points, everything, everything)
 
@@ -113,7 +114,7 @@ def test_a_map_off_by_more_than_the_threshold_is_wrong_and_by_less_is_right() ->
 
 def test_hidden_points_count_for_nothing() -> None:
     points, faces = ROOM
-    samples = _sample_surface(points, faces, 30_000, np.random.default_rng(1)).astype(np.float32)
+    samples = sample_surface(points, faces, 30_000, np.random.default_rng(1)).astype(np.float32)
     on_floor = samples[:, 2] < 0.01
     truth = Truth.of(samples, exposed=~on_floor, visible=~on_floor)
     result = score(*floor(), truth, BOX)
@@ -122,7 +123,7 @@ def test_hidden_points_count_for_nothing() -> None:
 
 
 def test_visible_and_exposed_recall_are_over_their_own_points() -> None:
-    samples = _sample_surface(*ROOM, 30_000, np.random.default_rng(1)).astype(np.float32)
+    samples = sample_surface(*ROOM, 30_000, np.random.default_rng(1)).astype(np.float32)
     on_floor = samples[:, 2] < 0.01
     truth = Truth.of(samples, exposed=np.ones(30_000, bool), visible=on_floor)
     result = score(*floor(), truth, BOX)
@@ -167,7 +168,7 @@ def test_nearness_to_the_surface_is_exact(seed: int, threshold_m: float) -> None
     weights = rng.dirichlet(np.ones(3), 200)
     on_faces = np.einsum("kc,fcx->fkx", weights, corners).reshape(-1, 3)
     upper_bound = np.linalg.norm(points[:, None] - on_faces, axis=2).min(axis=1)
-    near = _near_surface(points, vertices, faces, threshold_m)
+    near = near_surface(points, vertices, faces, threshold_m)
     assert near[upper_bound <= threshold_m].all()
 
     proper = faces[np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) > 0]
@@ -175,7 +176,7 @@ def test_nearness_to_the_surface_is_exact(seed: int, threshold_m: float) -> None
     scene.add_triangles(o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(proper.astype(np.uint32)))
     exact = scene.compute_distance(o3d.core.Tensor.from_numpy(points)).numpy()
     clear = np.abs(exact - threshold_m) > 1e-4
-    near = _near_surface(points, vertices, proper, threshold_m)
+    near = near_surface(points, vertices, proper, threshold_m)
     np.testing.assert_array_equal(near[clear], (exact <= threshold_m)[clear])
 
 
@@ -208,6 +209,29 @@ def test_truth_survives_the_file(tmp_path: Path) -> None:
     np.testing.assert_array_equal(truth.visible, visible[exposed])
 
 
+def test_truth_knows_its_furniture_and_files_of_earlier_versions_have_none(tmp_path: Path) -> None:
+    samples = {
+        "points": np.random.default_rng(0).random((4, 3)).astype(np.float32),
+        "exposed": np.array([True, True, False, True]),
+        "visible": np.ones(4, bool),
+    }
+    np.savez(tmp_path / "truth_samples.npz", **samples)  # type: ignore[arg-type]
+    old = load_truth(tmp_path)
+    assert old is not None
+    assert (old.thing.tolist(), old.names, old.box) == ([NO_THING] * 3, (), None)
+
+    more = {
+        "thing": np.array([0, -1, 1, 1], np.int32),
+        "names": np.array(["sofa", "lamp"]),
+        "box": np.array([[0, 0, 0], [2, 3, 1]]),
+    }
+    np.savez(tmp_path / "truth_samples.npz", **samples, **more)  # type: ignore[arg-type]
+    new = load_truth(tmp_path)
+    assert new is not None
+    assert (new.thing.tolist(), new.names) == ([0, -1, 1], ("sofa", "lamp"))
+    assert new.box == Box(lower_m=(0, 0, 0), upper_m=(2, 3, 1))
+
+
 def test_a_run_without_truth_has_none(tmp_path: Path) -> None:
     assert load_truth(tmp_path) is None
 
@@ -219,9 +243,16 @@ def test_a_run_without_truth_has_none(tmp_path: Path) -> None:
         {"points": np.zeros((4, 2), np.float32), "exposed": np.ones(4, bool), "visible": np.ones(4, bool)},
         {"points": np.zeros((4, 3), np.float32), "exposed": np.ones(4, bool), "visible": np.ones(3, bool)},
         {"points": np.zeros((4, 3), np.float32), "exposed": np.ones(4, int), "visible": np.ones(4, bool)},
+        {
+            "points": np.zeros((4, 3), np.float32),
+            "exposed": np.ones(4, bool),
+            "visible": np.ones(4, bool),
+            "thing": np.arange(4, dtype=np.int32),
+            "names": np.array(["sofa"]),
+        },
         {"points": np.full((4, 3), np.nan, np.float32), "exposed": np.ones(4, bool), "visible": np.ones(4, bool)},
     ],
-    ids=["missing array", "points not 3-D", "lengths differ", "not bool", "not finite"],
+    ids=["missing array", "points not 3-D", "lengths differ", "not bool", "things without names", "not finite"],
 )
 def test_unusable_truth_is_refused_by_name(tmp_path: Path, arrays: dict[str, np.ndarray]) -> None:
     np.savez(tmp_path / "truth_samples.npz", **arrays)  # type: ignore[arg-type]

@@ -10,8 +10,10 @@ from protocol.errors import SceneError
 from protocol.mission import Camera, Drone, Flight, Mission, Target
 from sim_bridge.scenes import truth as truth_module
 from sim_bridge.scenes.cropping import crop_to_box
+from sim_bridge.scenes.living_room import WALL_M
 from sim_bridge.scenes.scene import Scene, pack_scene
 from sim_bridge.scenes.surfaces import Material, box, join, quad
+from sim_bridge.scenes.things import NO_THING, Thing, thing_at, things_of
 from sim_bridge.scenes.truth import SAMPLES_PER_M2, Truth, write_truth
 from sim_bridge.scenes.visibility import depression_range
 
@@ -66,6 +68,27 @@ def test_the_floor_under_a_closed_box_is_hidden_and_everything_else_is_seen(plai
     assert plain.visible[top].all()
     sides = on_cube(plain) & ~top & (plain.points[:, 2] > 0.1)
     assert plain.visible[sides].mean() > 0.99
+
+
+def test_points_belong_to_the_thing_on_whose_surface_they_lie() -> None:
+    things = [
+        Thing("crate", box((1.0, 1.0, 1.0), Material(0)).triangles),
+        Thing("crate 2", box((0.5, 0.5, 0.5), Material(0), (2.0, 0.0, 0.0)).triangles),
+    ]
+    points = np.array([(0.5, 0.2, 0.3), (2.0, 0.1, 0.5), (1.2, 0.0, 0.0), (0.5, 0.2, 1.01)], np.float32)
+    assert thing_at(points, things).tolist() == [0, 1, NO_THING, NO_THING]
+    assert thing_at(points, []).tolist() == [NO_THING] * 4
+
+
+@pytest.mark.parametrize("spec", ["living_room", "room-3"])
+def test_built_in_rooms_name_their_furniture_and_all_of_it_stands_in_the_room(spec: str) -> None:
+    things = things_of(spec)
+    names = [thing.name for thing in things]
+    assert len(set(names)) == len(names)
+    assert {"sofa", "chair", "chair 2", "dining table", "wardrobe"} <= set(names)
+    corners = np.concatenate([thing.triangles.reshape(-1, 3) for thing in things])
+    assert np.abs(corners[:, :2]).max() < WALL_M
+    assert things_of("./my.glb") == []
 
 
 def test_what_is_seen_is_exposed(plain: Truth) -> None:
