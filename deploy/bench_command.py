@@ -12,7 +12,10 @@ from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
 if TYPE_CHECKING:
+    from deploy.bench.executors import Executor
     from deploy.bench.plan import Job, Wish
+    from deploy.bench.progress import Tally, Watch
+    from deploy.bench.rooms import MapJob
     from ground_station.study.plan_file import Study
 
 bench_app = App(
@@ -27,6 +30,7 @@ bench_app = App(
 Which = Literal["lawnmower", "persistent", "angle_aware_down", "angle_aware", "none", "grid", "m3c2"]
 Positive = Number(gt=0)
 AtLeastOne = Number(gte=1)
+Share = Number(gte=0, lte=1)
 
 Seeds = Annotated[int | None, Parameter(validator=AtLeastOne, help="Flights of each kind, with seeds from 1 on.")]
 Duration = Annotated[float | None, Parameter(validator=Positive, help="Mission time of each flight, in seconds.")]
@@ -46,6 +50,10 @@ PAPER_SEEDS, PAPER_DURATION_S = 3, 900.0
 QUICK_SEEDS, QUICK_DURATION_S = 1, 200.0
 """Long enough for feedback, which begins after some 100 s of one drone's flight."""
 FEEDBACK_SEEDS, FEEDBACK_DURATION_S = 5, 600.0
+QUICK_ROOMS = 2
+FLYING = "flying"
+"""Folder of what flies at the moment, in the study's."""
+MAPS_WORDS = ("maps made", "being made")
 
 
 @bench_app.command
@@ -133,6 +141,70 @@ def feedback(
     return _study("feedback", wish, planned, out, jobs, executor, ray_address, page)
 
 
+@bench_app.command
+def reconstruction(
+    *,
+    quick: Annotated[bool, Parameter(negative="")] = False,
+    rooms: Annotated[int, Parameter(validator=AtLeastOne)] = 10,
+    contrasts: Annotated[tuple[float, ...], Parameter(negative="", consume_multiple=True, validator=Share)] = (
+        1.0,
+        0.25,
+        0.1,
+    ),
+    backends: Annotated[tuple[str, ...], Parameter(negative="", consume_multiple=True)] = ("plane_sweep",),
+    mission: MissionFile = PAPER_MISSION,
+    settings: Settings = (),
+    out: Path = Path("benches/reconstruction"),
+    jobs: Jobs = None,
+    report_only: ReportOnly = False,
+    page: Page = None,
+) -> int:
+    """How good are maps of rooms that nothing was tuned on? Each room is flown once under each texture, and every
+    backend makes its map of the same keyframes.
+
+    Four drones without feedback fly until J is below 0.05. Flights keep their keyframes, some 40 MB each.
+
+    ```
+    covrecon bench reconstruction                                       # 10 rooms, three textures: half an hour
+    covrecon bench reconstruction --quick                               # two rooms
+    covrecon bench reconstruction --backends plane_sweep plane_sweep:high depth
+    covrecon bench reconstruction --set reconstruction.voxel_m=0.02     # other maps of the same flights
+    ```
+
+    Parameters
+    ----------
+    quick
+        Two rooms.
+    rooms
+        How many; the first is room-901, and those from there on are for this alone.
+    contrasts
+        Of the textures: 1 as drawn, 0 plain colours.
+    backends
+        As in reconstruction.backend, or with a quality of `covrecon reconstruct` behind a colon. One that cannot
+        make a map of these keyframes is left out, and the table says why.
+    out
+        The study's folder, that holds flights, maps, tables and figures.
+    """
+    from deploy.bench.executors import LocalExecutor
+    from deploy.bench.flight import KEPT_TO_MAP
+    from deploy.bench.plan import cores, plan_of
+    from deploy.bench.rooms import LONGEST_S, map_jobs, room_jobs
+    from ground_station.study.plan_file import write_plan
+
+    if report_only:
+        return _report(out, page)
+    wish = _wish(mission, LONGEST_S, QUICK_ROOMS if quick else rooms, settings)
+    flights = room_jobs(wish, contrasts)
+    maps = map_jobs(flights, backends, wish.settings)
+    write_plan(out, plan_of("reconstruction", wish, flights, _command(), [job.planned for job in maps]))
+    slots = jobs or cores()
+    code = _fly(out, wish, flights, LocalExecutor(slots, out / FLYING, KEPT_TO_MAP))
+    if code > 1:
+        return code
+    made = _make_maps(out, maps, slots)
+    return made if made > 1 else max(code, made, _report(out, page))
+
+
 def _wish(mission: Path, duration_s: float, seeds: int, settings: Sequence[str]) -> Wish:
     from deploy.bench.plan import Wish, assignments
 
@@ -150,42 +222,71 @@ def _study(
     page: Path | None,
 ) -> int:
     """Fly what is left and tell; an exit code."""
-    import asyncio
-
-    from rich.console import Console
-
-    from deploy.bench.campaign import fly_all, left_of
-    from deploy.bench.executors import Executor, LocalExecutor
+    from deploy.bench.executors import LocalExecutor
     from deploy.bench.plan import cores, plan_of
-    from deploy.bench.progress import LiveWatch, PlainWatch, Tally
-    from deploy.mission_run import compile_everything
     from ground_station.study.plan_file import write_plan
 
-    command = shlex.join(["covrecon", *sys.argv[1:]])
-    plan = plan_of(study, wish, jobs, command)
-    write_plan(out, plan)
-    left = left_of(out, jobs)
+    write_plan(out, plan_of(study, wish, jobs, _command()))
     executor: Executor
     if place == "ray":
         from deploy.bench.ray_executor import RayExecutor
 
         executor = RayExecutor(ray_address, slots)
     else:
-        executor = LocalExecutor(slots or cores(), out / "flying")
-    code = 0
-    tally = Tally.of(plan.flights, [job.planned for job in left], wish.duration_s)
-    terminal = Console(highlight=False)
-    with (
-        LiveWatch(tally, terminal)
-        if terminal.is_terminal
-        else PlainWatch(tally, lambda text: print(text, flush=True)) as watch
-    ):
-        if left:
-            watch.say(f"{len(left)} of {len(jobs)} flights to fly, into {out}")
-            compile_everything(left[0].mission)  # here once, and not in all of the first flights at the same time
-            code = asyncio.run(fly_all(out, left, executor, watch))
+        executor = LocalExecutor(slots or cores(), out / FLYING)
+    code = _fly(out, wish, jobs, executor)
     # What flew is told, also beside flights that failed; not after an interrupt, for whoever did that wants to leave.
     return code if code > 1 else max(code, _report(out, page))
+
+
+def _fly(out: Path, wish: Wish, jobs: Sequence[Job], executor: Executor) -> int:
+    """What is left; an exit code, over 1 after an interrupt."""
+    import asyncio
+
+    from deploy.bench.campaign import fly_all, left_of
+    from deploy.bench.progress import Tally
+    from deploy.mission_run import compile_everything
+
+    left = left_of(out, jobs)
+    if not left:
+        return 0
+    tally = Tally.of([job.planned for job in jobs], [job.planned for job in left], wish.duration_s)
+    with _watch(tally) as watch:
+        watch.say(f"{len(left)} of {len(jobs)} flights to fly, into {out}")
+        compile_everything(left[0].mission)  # here once, and not in all of the first flights at the same time
+        return asyncio.run(fly_all(out, left, executor, watch))
+
+
+def _make_maps(out: Path, maps: Sequence[MapJob], slots: int) -> int:
+    """Of the flights that are flown; an exit code, over 1 after an interrupt."""
+    import asyncio
+
+    from deploy.bench.maps import make_maps, maps_left
+    from deploy.bench.progress import Tally
+
+    left = maps_left(out, maps)
+    if not left:
+        return 0
+    tally = Tally({job.planned.name: 1.0 for job in left}, len(maps) - len(left), len(maps), words=MAPS_WORDS)
+    with _watch(tally) as watch:
+        watch.say(f"{len(left)} of {len(maps)} maps to make, into {out}")
+        return asyncio.run(make_maps(out, left, slots, watch))
+
+
+def _watch(tally: Tally) -> Watch:
+    from rich.console import Console
+
+    from deploy.bench.progress import LiveWatch, PlainWatch
+
+    terminal = Console(highlight=False)
+    if terminal.is_terminal:
+        return LiveWatch(tally, terminal)
+    return PlainWatch(tally, lambda text: print(text, flush=True))
+
+
+def _command() -> str:
+    """By which this study is flown, for people."""
+    return shlex.join(["covrecon", *sys.argv[1:]])
 
 
 def _report(folder: Path, page: Path | None) -> int:

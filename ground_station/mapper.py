@@ -20,7 +20,7 @@ from ground_station.external_map import ExternalMap
 from ground_station.keyframe_log import KeyframeStore
 from ground_station.mesh_change_choice import make_mesh_change
 from ground_station.reconstruction.backends import make_reconstructor
-from ground_station.reconstruction.reconstructor import Keyframe, Mesh, State
+from ground_station.reconstruction.reconstructor import Keyframe, Mesh, State, Statistics
 from protocol import messages
 from protocol.depth_image import decode_depth
 from protocol.errors import MessageError, ReconstructionError
@@ -123,11 +123,17 @@ class Mapper:
         feeds_back = self._mission.feedback.method != "none"
         return self._comparing_s / self._compared if feeds_back and self._compared else None
 
-    def finish(self) -> MapUpdate:
+    def finish(self, *, scored: bool = True) -> MapUpdate:
         """The last mesh, with what still waited for later views, scored in full."""
         self._reconstructor.flush()
         mesh = self._reconstructor.mesh()
-        return MapUpdate(mesh, self._change.update(mesh), self._score(mesh, FULL_SAMPLES))
+        self.refused = self._unreadable + sum(self._reconstructor.statistics().refused.values())
+        return MapUpdate(mesh, self._change.update(mesh), self._score(mesh, FULL_SAMPLES) if scored else None)
+
+    @property
+    def statistics(self) -> Statistics:
+        """The reconstructor's."""
+        return self._reconstructor.statistics()
 
     def floor_scores(self) -> Scores | None:
         """What nothing but a bare floor scores here."""

@@ -10,7 +10,7 @@ import shutil
 import signal
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Coroutine, Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -37,20 +37,25 @@ def left_of(folder: Path, jobs: Sequence[Job]) -> list[Job]:
 
 
 async def fly_all(folder: Path, jobs: Sequence[Job], executor: Executor, watch: Watch) -> int:
-    """Fly ``jobs`` into the study's folder; the exit code: 0, 1 if any failed, 128 + n if signal n ended it.
+    """Fly ``jobs`` into the study's folder; the exit code, as of `until_interrupted`.
 
     A flight that fails is told, and the others fly on. After a signal the flights under way are ended and forgotten.
     """
+    return await until_interrupted(_Campaign(folder, jobs, executor, watch).run(), "flights", watch)
+
+
+async def until_interrupted(work: Coroutine[Any, Any, int], what: str, watch: Watch) -> int:
+    """Await ``work``, which says how many failed; the exit code: 0, 1 if any did, 128 + n if signal n ended it."""
     with interruption() as interrupted:
-        flying = asyncio.create_task(_Campaign(folder, jobs, executor, watch).run())
-        watched: set[asyncio.Future[Any]] = {flying, interrupted}
+        working = asyncio.create_task(work)
+        watched: set[asyncio.Future[Any]] = {working, interrupted}
         await asyncio.wait(watched, return_when=asyncio.FIRST_COMPLETED)
-        if flying.done():
-            return 1 if flying.result() else 0
+        if working.done():
+            return 1 if working.result() else 0
         number: signal.Signals = interrupted.result()
-        watch.say(f"{number.name}: ending the flights; the same command goes on with those that are left")
-        flying.cancel()
-        await asyncio.gather(flying, return_exceptions=True)
+        watch.say(f"{number.name}: ending the {what}; the same command goes on with those that are left")
+        working.cancel()
+        await asyncio.gather(working, return_exceptions=True)
         return 128 + number
 
 
@@ -65,7 +70,7 @@ class _Campaign:
         """How many failed."""
         self._flights.mkdir(parents=True, exist_ok=True)
         async with AsyncExitStack() as stack:
-            stack.enter_context(_alone(self._flights))
+            stack.enter_context(alone(self._flights))
             for draft in self._flights.glob(".*.draft"):
                 shutil.rmtree(draft)
             await stack.enter_async_context(self._executor.ready())
@@ -118,7 +123,7 @@ class _Campaign:
 
 
 @contextmanager
-def _alone(folder: Path) -> Iterator[None]:
+def alone(folder: Path) -> Iterator[None]:
     """Two studies in one folder would fly the same flights. Raises `ProcessError` if another flies there."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Protocol
 
-from deploy.bench.flight import flown_s, fly_in
+from deploy.bench.flight import KEPT, flown_s, fly_in
 
 
 class Executor(Protocol):
@@ -30,9 +30,12 @@ class Executor(Protocol):
 class LocalExecutor:
     """Processes of this machine, as many flights at once as ``slots``."""
 
-    def __init__(self, slots: int, scratch: Path) -> None:
-        """Flights are flown in folders of their own below ``scratch``, which is this executor's alone, and removed."""
-        self.slots = slots
+    def __init__(self, slots: int, scratch: Path, kept: Sequence[str] = KEPT) -> None:
+        """Flights are flown in folders of their own below ``scratch``, which is this executor's alone, and removed.
+
+        Of each, the files ``kept`` are.
+        """
+        self.slots, self._kept = slots, kept
         self._scratch = scratch
         self._places: dict[str, Path] = {}
 
@@ -49,7 +52,7 @@ class LocalExecutor:
         with TemporaryDirectory(prefix=f"{name}-", dir=self._scratch, ignore_cleanup_errors=True) as place:
             self._places[name] = Path(place)
             try:
-                return await fly_in(Path(place), mission_json)
+                return await fly_in(Path(place), mission_json, self._kept)
             finally:
                 del self._places[name]
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from ground_station.replay.settings import value_of
 from ground_station.results import versions
-from ground_station.study.plan_file import Method, Plan, PlannedFlight, Study
+from ground_station.study.plan_file import Method, Plan, PlannedFlight, PlannedMap, Study
 from protocol.errors import MissionError
 from protocol.mission import Drone, Mission
 from protocol.mission_faults import check
@@ -77,8 +77,8 @@ def paper_jobs(wish: Wish, methods: Sequence[Method]) -> list[Job]:
     if "grid" in methods:
         kinds += [("grid", drones, None) for drones in TEAMS]
         kinds += [("grid", 1, threshold) for threshold in PORTRAYED]
-    return _once(
-        _job(wish, method, drones=drones, seed=seed, threshold=threshold)
+    return once(
+        job_of(wish, method, drones=drones, seed=seed, threshold=threshold)
         for seed in range(1, wish.seeds + 1)
         for method, drones, threshold in kinds
     )
@@ -86,26 +86,27 @@ def paper_jobs(wish: Wish, methods: Sequence[Method]) -> list[Job]:
 
 def feedback_jobs(wish: Wish, scenes: Sequence[str]) -> list[Job]:
     """One drone without feedback and one with the grid's, in each scene. Raises `MissionError`."""
-    return _once(
-        _job(wish, method, seed=seed, scene=scene)
+    return once(
+        job_of(wish, method, seed=seed, scene=scene)
         for seed in range(1, wish.seeds + 1)
         for scene in scenes
         for method in CONTRASTED
     )
 
 
-def _once(jobs: Iterable[Job]) -> list[Job]:
+def once(jobs: Iterable[Job]) -> list[Job]:
     """Without those that come to the same."""
     return list({job.planned.key: job for job in jobs}.values())
 
 
-def plan_of(study: Study, wish: Wish, jobs: Sequence[Job], command: str) -> Plan:
+def plan_of(study: Study, wish: Wish, jobs: Sequence[Job], command: str, maps: Sequence[PlannedMap] = ()) -> Plan:
     return Plan(
         study=study,
         command=command,
         machine=f"{cores()} cores, {platform.machine()}, Python {platform.python_version()}",
         duration_s=wish.duration_s,
         flights=tuple(job.planned for job in jobs),
+        maps=tuple(maps),
     )
 
 
@@ -128,7 +129,7 @@ def assignments(texts: Sequence[str]) -> dict[str, Any]:
     return found
 
 
-def _job(
+def job_of(
     wish: Wish,
     method: Method,
     *,
@@ -136,7 +137,9 @@ def _job(
     drones: int = 1,
     threshold: float | None = None,
     scene: str | None = None,
+    more: Mapping[str, Any] | None = None,
 ) -> Job:
+    """``more``: settings that belong to the study, and that nobody's wish changes."""
     planner, feedback = METHODS[method]
     replaced: dict[str, Any] = {
         "duration_s": wish.duration_s,
@@ -148,6 +151,7 @@ def _job(
         **wish.settings,
         "controller.planner": planner,
         "feedback.method": feedback,
+        **(more or {}),
     }
     if threshold is not None:
         replaced["feedback.threshold"] = threshold
@@ -160,6 +164,7 @@ def _job(
         threshold=mission.feedback.threshold,
         scene=Path(mission.simulation.scene).stem,
         seed=seed,
+        contrast=mission.simulation.texture_contrast,
         key=key_of(mission),
     )
     return Job(planned, mission)

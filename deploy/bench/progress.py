@@ -34,6 +34,8 @@ class Tally:
     """Of each flight that flies, how much of it is flown."""
     done: float = 0.0
     """Work of the flights that ended in this call."""
+    words: tuple[str, str] = ("flights flown", "flying")
+    """What is done, and what is being done; where it is something else than flights."""
 
     @classmethod
     def of(cls, planned: Sequence[PlannedFlight], left: Sequence[PlannedFlight], duration_s: float) -> Self:
@@ -57,7 +59,8 @@ class Tally:
     def text(self, elapsed_s: float) -> str:
         rest_s = self.rest_s(elapsed_s)
         rest = f"about {duration_text(rest_s)} left" if math.isfinite(rest_s) else "time left not known yet"
-        return f"{self.flown} of {self.total} flights flown, {len(self.shares)} flying, {rest}"
+        finished, under_way = self.words
+        return f"{self.flown} of {self.total} {finished}, {len(self.shares)} {under_way}, {rest}"
 
 
 SHARED_WORK = 2.0

@@ -10,8 +10,10 @@ from pathlib import Path
 
 from ground_station.durable import replace_file
 from ground_station.study import paper
-from ground_station.study.drawings import draw_curves, draw_gains, draw_portraits
+from ground_station.study.drawings import draw_curves, draw_gains, draw_portraits, shown
 from ground_station.study.flown import Flown, load_flown
+from ground_station.study.map_pages import write_maps
+from ground_station.study.mapped import load_mapped
 from ground_station.study.meshes import draw_meshes
 from ground_station.study.plan_file import Plan, read_plan
 from ground_station.study.tables import (
@@ -39,11 +41,8 @@ def write_study(folder: Path) -> Path:
         CovreconError: there is no study or no flight yet, or one cannot be read, or the disk refuses a file.
     """
     plan = read_plan(folder)
-    flights = load_flown(folder, plan)
-    if not flights:
-        raise CovreconError(f"{folder}: no flight is flown to its end yet")
     try:
-        text = "\n".join((_paper_page if plan.study == "paper" else _feedback_page)(folder, plan, flights)) + "\n"
+        text = "\n".join(_maps_page(folder, plan) if plan.study == "reconstruction" else _page(folder, plan)) + "\n"
         replace_file(folder / PAGE_FILE, [text.encode()])
     except OSError as error:
         raise StorageError(f"{error.filename or folder}: {error.strerror}") from error
@@ -74,10 +73,26 @@ def put_into(page: Path, folder: Path) -> None:
         raise StorageError(f"{error.filename or page}: {error.strerror}") from error
 
 
+def _page(folder: Path, plan: Plan) -> Iterator[str]:
+    flights = load_flown(folder, plan)
+    if not flights:
+        raise CovreconError(f"{folder}: no flight is flown to its end yet")
+    yield from (_paper_page if plan.study == "paper" else _feedback_page)(folder, plan, flights)
+
+
+def _maps_page(folder: Path, plan: Plan) -> Iterator[str]:
+    maps = load_mapped(folder, plan)
+    if not maps:
+        raise CovreconError(f"{folder}: no map is made yet")
+    made = f"{len(maps)} of {len(plan.maps)} maps of {len(plan.flights)} flights"
+    yield from _heading("How good maps of random rooms are", plan, made)
+    yield from write_maps(folder, maps)
+
+
 def _paper_page(folder: Path, plan: Plan, flights: list[Flown]) -> Iterator[str]:
     rows = method_rows(flights)
     replace_file(folder / "methods.csv", [methods_csv(rows).encode()])
-    yield from _heading("Every method of the paper", plan, flights)
+    yield from _heading("Every method of the paper", plan, _flown(plan, flights))
     yield methods_markdown(rows)
     yield ""
     yield "Mean ± standard deviation over the seeds; (n of m) where only so many flights reached it. F, precision and"
@@ -86,31 +101,34 @@ def _paper_page(folder: Path, plan: Plan, flights: list[Flown]) -> Iterator[str]
     yield from _order(rows)
     yield from _teams(rows)
     for column, label, name in (("importance", "importance J", "J"), ("f_score_visible", "F visible", "F")):
-        yield from _shown(
+        yield from shown(
             f"{name}(t), mean and range over the seeds", draw_curves(flights, column, label, folder / name)
         )
-    yield from _shown("Phase portraits by J_th", draw_portraits(flights, folder / "portraits"))
-    yield from _shown("Final maps of the first seed", draw_meshes(flights, folder / "meshes"))
+    yield from shown("Phase portraits by J_th", draw_portraits(flights, folder / "portraits"))
+    yield from shown("Final maps of the first seed", draw_meshes(flights, folder / "meshes"))
 
 
 def _feedback_page(folder: Path, plan: Plan, flights: list[Flown]) -> Iterator[str]:
     rows = gain_rows(flights, plan.duration_s)
     replace_file(folder / "gains.csv", [gains_csv(rows).encode()])
-    yield from _heading("Does feedback help?", plan, flights)
+    yield from _heading("Does feedback help?", plan, _flown(plan, flights))
     yield gains_markdown(rows)
     yield ""
     yield "F at 5 cm with grid feedback minus F without, at the same mission time, of flights with the same seed; in"
     yield "brackets the 95 % confidence interval of the mean difference (Student's t), bold where it leaves out zero."
     yield ""
-    yield from _shown("Gain over time", draw_gains(flights, plan.duration_s, folder / "gain"))
+    yield from shown("Gain over time", draw_gains(flights, plan.duration_s, folder / "gain"))
 
 
-def _heading(title: str, plan: Plan, flights: Sequence[Flown]) -> Iterator[str]:
+def _heading(title: str, plan: Plan, done: str) -> Iterator[str]:
     yield f"### {title}"
     yield ""
-    flown = f"{len(flights)} of {len(plan.flights)} flights of {plan.duration_s:g} s"
-    yield f"`{plan.command}`: {flown}, on {plan.machine}."
+    yield f"`{plan.command}`: {done}, on {plan.machine}."
     yield ""
+
+
+def _flown(plan: Plan, flights: Sequence[Flown]) -> str:
+    return f"{len(flights)} of {len(plan.flights)} flights of {plan.duration_s:g} s"
 
 
 def _order(rows: Sequence[MethodRow]) -> Iterator[str]:
@@ -136,12 +154,3 @@ def _teams(rows: Sequence[MethodRow]) -> Iterator[str]:
     difference = four["f_visible"].mean - one["f_visible"].mean
     yield f"Four drones' F of the visible surface is one drone's {difference:+.3f}."
     yield ""
-
-
-def _shown(caption: str, files: Sequence[Path]) -> Iterator[str]:
-    """By the first of the files, a drawing's SVG."""
-    if files:
-        yield f"![{caption}]({files[0].name})"
-        yield ""
-        yield f"*{caption}.*"
-        yield ""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeAlias
@@ -95,7 +95,7 @@ def draw_curves(flights: Sequence[Flown], column: str, ylabel: str, stem: Path) 
             axes.legend(fontsize=8)
         row[0].set_ylabel(ylabel)
 
-    return _saved(draw, stem, columns=len(panels)) if panels else []
+    return saved(draw, stem, columns=len(panels)) if panels else []
 
 
 def draw_portraits(flights: Sequence[Flown], stem: Path) -> list[Path]:
@@ -128,7 +128,7 @@ def draw_portraits(flights: Sequence[Flown], stem: Path) -> list[Path]:
         rows[1, 0].set_ylabel("F visible")
         rows[0, 0].legend(fontsize=8)
 
-    return _saved(draw, stem, columns=len(shown), rows=2) if shown else []
+    return saved(draw, stem, columns=len(shown), rows=2) if shown else []
 
 
 def rate_of(time_s: Floats, importance: Floats) -> Floats:
@@ -167,7 +167,7 @@ def draw_gains(flights: Sequence[Flown], duration_s: float, stem: Path) -> list[
             rows[0, column].set_title(scene)
             rows[-1, column].set_xlabel("mission time (s)")
 
-    return _saved(draw, stem, columns=len(scenes), rows=len(SURFACES)) if scenes else []
+    return saved(draw, stem, columns=len(scenes), rows=len(SURFACES)) if scenes else []
 
 
 def pictures(tiles: Mapping[str, Picture], stem: Path, most_columns: int) -> list[Path]:
@@ -183,10 +183,10 @@ def pictures(tiles: Mapping[str, Picture], stem: Path, most_columns: int) -> lis
             axes.imshow(picture)
             axes.set_title(title, fontsize=9)
 
-    return _saved(draw, stem, columns=columns, rows=rows, inches=TILE_INCHES, vector=False)
+    return saved(draw, stem, columns=columns, rows=rows, inches=TILE_INCHES, vector=False)
 
 
-def _saved(
+def saved(
     draw: Callable[[Figure], None],
     stem: Path,
     *,
@@ -210,3 +210,12 @@ def _saved(
         paths.append(stem.with_suffix(".png"))
         figure.savefig(paths[-1], dpi=PNG_DPI, metadata={"Software": None})
     return paths
+
+
+def shown(caption: str, files: Sequence[Path]) -> Iterator[str]:
+    """A figure in Markdown with its caption: by the first of its files, a drawing's SVG; nothing without files."""
+    if files:
+        yield f"![{caption}]({files[0].name})"
+        yield ""
+        yield f"*{caption}.*"
+        yield ""

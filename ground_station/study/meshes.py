@@ -26,9 +26,9 @@ def draw_meshes(flights: list[Flown], stem: Path) -> list[Path]:
     frame = None
     for series, flown in by_series(flights).items():
         first = flown[0]
-        truth, mesh = _truth(first.folder), first.mesh()
+        truth, mesh = truth_of(first.folder), first.mesh()
         if frame is None:
-            frame = _corners(first.folder)
+            frame = corners_of(first.folder)
             if truth is not None:
                 tiles["the scene"] = oblique_view(truth, *TILE_PX, framed=frame)
         if mesh is not None:
@@ -37,14 +37,14 @@ def draw_meshes(flights: list[Flown], stem: Path) -> list[Path]:
     return pictures(tiles, stem, COLUMNS) if tiles else []
 
 
-def _corners(folder: Path) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+def corners_of(folder: Path) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
     """(8, 3), of the target box."""
     target = load_run(folder).mission.target
     ends = zip(target.lower_m, target.upper_m, strict=True)
     return np.stack(np.meshgrid(*ends), axis=-1).reshape(-1, 3).astype(np.float32)
 
 
-def _truth(folder: Path) -> Mesh | None:
+def truth_of(folder: Path) -> Mesh | None:
     path = folder / TRUTH_MESH_FILE
     if not path.exists():
         return None

@@ -19,7 +19,11 @@ FLIGHTS_FOLDER = "flights"
 TRUTH_MESH_FILE = "truth.ply"
 """The scene's own surface, which the simulator leaves in a run's folder."""
 
-Study: TypeAlias = Literal["paper", "feedback"]
+MAPS_FOLDER = "maps"
+FIGURES_FILE = "figures.json"
+"""Of a map's folder; it holds either figures, or the ``reason`` why there are none."""
+
+Study: TypeAlias = Literal["paper", "feedback", "reconstruction"]
 Method: TypeAlias = Literal["lawnmower", "persistent", "angle_aware_down", "angle_aware", "none", "grid", "m3c2"]
 """How drones decide where to fly: a planner of others, or this controller with one kind of feedback."""
 
@@ -36,6 +40,8 @@ class PlannedFlight(BaseModel):
     """J_th."""
     scene: str
     seed: int
+    contrast: float = 1.0
+    """Of the scene's textures."""
     key: str
     """Of all that its result depends on: settings and versions."""
 
@@ -43,6 +49,7 @@ class PlannedFlight(BaseModel):
     def name(self) -> str:
         """For people."""
         parts = [self.method, f"x{self.drones}", f"th{100 * self.threshold:.0f}", Path(self.scene).stem]
+        parts += [f"texture{100 * self.contrast:g}"] if self.contrast != 1.0 else []
         return "-".join([*parts, f"seed{self.seed}"])
 
     @property
@@ -53,6 +60,28 @@ class PlannedFlight(BaseModel):
     @property
     def series(self) -> Series:
         return self.scene, self.method, self.drones, self.threshold
+
+
+class PlannedMap(BaseModel):
+    """A map that is made after a flight from what it photographed."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    flight: PlannedFlight
+    way: str
+    """How: a backend, or a backend and a quality (`ground_station.rebuild.quality`) with a colon between."""
+    key: str
+    """Of all that it depends on beside the flight: settings, versions and the reconstruction's code."""
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        return f"{self.flight.name}-{self.way.replace(':', '-')}"
+
+    @property
+    def folder(self) -> str:
+        """Under `MAPS_FOLDER`."""
+        return f"{self.name}-{self.flight.key[:6]}{self.key[:6]}"
 
 
 class Plan(BaseModel):
@@ -66,6 +95,7 @@ class Plan(BaseModel):
     duration_s: float
     """Mission time of each flight."""
     flights: tuple[PlannedFlight, ...]
+    maps: tuple[PlannedMap, ...] = ()
 
     @property
     def series(self) -> list[Series]:

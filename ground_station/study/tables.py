@@ -82,10 +82,10 @@ def methods_csv(rows: Sequence[MethodRow]) -> str:
         cells: list[object] = [*row.series, row.spreads[MEASURES[0].key].count]
         for measure in MEASURES:
             spread = row.spreads[measure.key]
-            cells += [_cell(spread.mean), _cell(spread.deviation), spread.known]
+            cells += [cell(spread.mean), cell(spread.deviation), spread.known]
             cells += [row.paper.get(measure.key, "")] if measure.key in PAPER_COLUMNS else []
         lines.append(cells)
-    return _csv([header, *lines])
+    return csv_text([header, *lines])
 
 
 def methods_markdown(rows: Sequence[MethodRow]) -> str:
@@ -156,13 +156,13 @@ def gains_csv(rows: Sequence[GainRow]) -> str:
         header += [f"f_{surface}_none", f"f_{surface}_gain", f"f_{surface}_gain_low", f"f_{surface}_gain_high"]
     lines: list[list[object]] = []
     for row in rows:
-        cells: list[object] = [row.scene, row.moment, _cell(row.time_s), row.gains["visible"].count]
+        cells: list[object] = [row.scene, row.moment, cell(row.time_s), row.gains["visible"].count]
         for surface in SURFACES:
             gain = row.gains[surface]
             ends = (gain.mean - gain.half_width, gain.mean + gain.half_width)
-            cells += [_cell(row.without[surface].mean), _cell(gain.mean), *map(_cell, ends)]
+            cells += [cell(row.without[surface].mean), cell(gain.mean), *map(cell, ends)]
         lines.append(cells)
-    return _csv([header, *lines])
+    return csv_text([header, *lines])
 
 
 def gains_markdown(rows: Sequence[GainRow]) -> str:
@@ -210,11 +210,11 @@ def markdown(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(lines())
 
 
-def _cell(value: float) -> object:
+def cell(value: float) -> object:
     return round(value, 6) if math.isfinite(value) else ""
 
 
-def _csv(rows: Sequence[Sequence[object]]) -> str:
+def csv_text(rows: Sequence[Sequence[object]]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()

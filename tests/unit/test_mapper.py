@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,66 +9,20 @@ from typing import Literal
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from PIL import Image
 
+from faults.floor_flight import HEIGHT_M, LEG, MISSION, fly
 from ground_station.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from ground_station.keyframe_log import KeyframeLog
 from ground_station.mapper import Mapper, MapState
 from protocol.depth_image import encode_depth
 from protocol.errors import StorageError
 from protocol.field import VirtualField
-from protocol.geometry import camera_rotation
 from protocol.messages import Keyframe
-from protocol.mission import Camera, Drone, Feedback, Mission, Reconstruction, Target
+from protocol.mission import Feedback, Mission, Reconstruction
 
-MISSION = Mission(
-    target=Target(lower_m=(-1, -1, 0), upper_m=(1, 1, 0.4)),
-    camera=Camera(width_px=160, height_px=90),
-    reconstruction=Reconstruction(sweep_width_px=96, depth_planes=32, nearest_m=0.6, farthest_m=2.5, workers=1),
-    feedback=Feedback(spacing_m=0.2),
-    drones=(Drone(id=1, start=(0, 0, 2, 0, 1.4)),),
-)
 FIELD = VirtualField.of(MISSION.target)
-HEIGHT_M, STEP_M, PATCH_PX = 1.4, 0.13, 4
-LEG = 14
 CUT = 8
 """Keyframes at the checkpoint."""
-
-
-def fly() -> list[Keyframe]:
-    """A drone looks straight down on a randomly patterned floor and moves sideways."""
-    camera = MISSION.camera.intrinsics()
-    rotation = camera_rotation(0.0, np.pi / 2)
-    step_px = round(STEP_M * camera.fx / HEIGHT_M)
-    width = camera.width + LEG * step_px
-    patches = np.random.default_rng(0).integers(0, 255, (camera.height // PATCH_PX + 1, width // PATCH_PX + 1, 3))
-    floor = patches.repeat(PATCH_PX, axis=0).repeat(PATCH_PX, axis=1).astype(np.uint8)
-    keyframes = []
-    for number in range(LEG):
-        view = floor[: camera.height, number * step_px : number * step_px + camera.width]
-        place = np.array([0.0, 0.0, HEIGHT_M]) + rotation[:, 0] * step_px * HEIGHT_M / camera.fx * (number - LEG / 2)
-        keyframes.append(message(number, np.ascontiguousarray(view), place.tolist(), rotation.tolist()))
-    return keyframes
-
-
-def message(number: int, image: NDArray[np.uint8], place: Sequence[float], rows: Sequence[Sequence[float]]) -> Keyframe:
-    jpeg = io.BytesIO()
-    Image.fromarray(image).save(jpeg, "JPEG", quality=95)
-    camera = MISSION.camera.intrinsics()
-    return Keyframe.model_validate(
-        {
-            "drone": 1,
-            "sequence": number,
-            "tick": 10 * number,
-            "position": tuple(place),
-            "rotation": tuple(map(tuple, rows)),
-            "width": camera.width,
-            "height": camera.height,
-            **{name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy")},
-            "jpeg": jpeg.getvalue(),
-        }
-    )
 
 
 FLIGHT = fly()
