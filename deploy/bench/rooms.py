@@ -30,8 +30,14 @@ LONGEST_S: Final = 300.0
 """A flight ends after this also if J is not there."""
 TABLE: Final = "reconstruction."
 """Settings of this table are for the maps, not for the flights: those are flown once."""
-CODE: Final = ("ground_station/reconstruction", "ground_station/rebuild", "ground_station/evaluate")
-"""Folders whose code a map depends on: it is made again when that changes, and the flight is not flown again."""
+CODE: Final = (
+    "ground_station/reconstruction",
+    "ground_station/rebuild",
+    "ground_station/evaluate",
+    "ground_station/evaluation.py",
+    "ground_station/mapper.py",
+)
+"""What a map and its figures depend on, weights included: maps are made again when it changes, and nothing is flown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,8 +103,10 @@ def _code_digest() -> str:
 
 
 def _sources() -> Iterator[Path]:
-    for folder in CODE:
-        yield from sorted((ROOT / folder).rglob("*.py"))
+    for name in CODE:
+        place = ROOT / name
+        found = [place] if place.is_file() else sorted(place.rglob("*"))
+        yield from (file for file in found if file.is_file() and file.parent.name != "__pycache__")
 
 
 def _depth() -> dict[str, Any]:

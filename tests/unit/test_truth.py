@@ -9,6 +9,7 @@ import trimesh
 from protocol.errors import SceneError
 from protocol.mission import Camera, Drone, Flight, Mission, Target
 from sim_bridge.scenes import truth as truth_module
+from sim_bridge.scenes.__main__ import main
 from sim_bridge.scenes.cropping import crop_to_box
 from sim_bridge.scenes.living_room import WALL_M
 from sim_bridge.scenes.scene import Scene, pack_scene
@@ -197,3 +198,21 @@ def test_cropping_keeps_the_area_inside_the_winding_and_the_place_in_the_source(
         for points, normal in zip(shares @ triangles, whole, strict=True)
     ]
     assert np.linalg.norm(normals, axis=1).sum() / 2 == pytest.approx(sum(inside), rel=0.01)
+
+
+def test_the_truth_of_a_scene_that_was_not_flown_is_written_by_a_process_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    trimesh.creation.box((1.0, 1.0, 1.0)).export(tmp_path / "cube.ply")
+    (tmp_path / "any.toml").write_text("[[drones]]\nid = 1\nstart = [0.0, 0.0, 3.0, 0.0, 1.3]\n")
+    out = tmp_path / "truth"
+    assert main([str(tmp_path / "cube.ply"), str(tmp_path / "any.toml"), str(out)]) == 0
+    with np.load(out / "truth_samples.npz") as data:
+        assert data["box"].tolist() == [[-3.0, -3.0, 0.0], [3.0, 3.0, 2.0]]
+        assert data["names"].shape == (0,)
+        assert data["visible"].any()
+    assert trimesh.load_mesh(out / "truth.ply", process=False).bounds[1].tolist() == [0.5, 0.5, 0.5]
+
+    assert main(["living_rom", str(tmp_path / "any.toml"), str(out)]) == 2
+    assert "living_rom: no such scene" in capsys.readouterr().err
