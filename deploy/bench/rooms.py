@@ -18,7 +18,6 @@ from ground_station.results import versions
 from ground_station.study.plan_file import PlannedMap
 from protocol.errors import MissionError
 from protocol.guard import ROOT
-from protocol.mission import Camera
 
 FIRST_ROOM: Final = 901
 """Rooms from here on are held out: what learns from random rooms must leave them alone."""
@@ -63,7 +62,7 @@ def room_jobs(wish: Wish, contrasts: Sequence[float]) -> list[Job]:
                 "stop_below": COVERED,
                 "simulation.texture_contrast": contrast,
                 "reconstruction.backend": "none",
-                **_depth(),
+                "camera.depth": True,  # for ways that begin from it
             },
         )
         for room in range(FIRST_ROOM, FIRST_ROOM + wish.seeds)
@@ -107,8 +106,3 @@ def _sources() -> Iterator[Path]:
         place = ROOT / name
         found = [place] if place.is_file() else sorted(place.rglob("*"))
         yield from (file for file in found if file.is_file() and file.parent.name != "__pycache__")
-
-
-def _depth() -> dict[str, Any]:
-    """Keyframes carry depth where cameras can measure it, for ways that begin from it."""
-    return {"camera.depth": True} if "depth" in Camera.model_fields else {}
