@@ -36,6 +36,27 @@ def camera_rotation(yaw_rad: float, pitch_rad: float) -> Floats:
     return np.column_stack([right, np.cross(forward, right), forward])
 
 
+def turn_matrix(vector: Floats) -> Floats:
+    """(3, 3) rotation about ``vector`` by its length (Rodrigues)."""
+    angle = float(np.linalg.norm(vector))
+    x, y, z = vector
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    if angle < 1e-8:
+        nearly: Floats = np.eye(3) + cross
+        return nearly
+    matrix: Floats = np.eye(3) + np.sin(angle) / angle * cross + (1 - np.cos(angle)) / angle**2 * cross @ cross
+    return matrix
+
+
+def rotation_vector(matrix: Floats) -> Floats:
+    """The inverse of `turn_matrix`, for angles well below pi."""
+    skew = np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]) / 2
+    sine = float(np.linalg.norm(skew))
+    angle = float(np.arctan2(sine, (np.trace(matrix) - 1) / 2))
+    vector: Floats = skew * (angle / sine if sine > 1e-8 else 1.0)
+    return vector
+
+
 @dataclass(frozen=True, slots=True)
 class Intrinsics:
     """Pinhole camera without distortion; focal lengths and principal point in pixels."""

@@ -248,6 +248,12 @@ class Reconstruction(Settings):
     """Other keyframes that one keyframe is compared with."""
     voxel_m: Positive = 0.025
     truncation_m: Positive = 0.05
+    refine_poses: bool = False
+    """Whether keyframes' poses are mended by what their images show, and refused where they cannot be."""
+    pose_sigma_m: Positive = 0.02
+    """Standard deviation, on each axis, of the position that comes with a keyframe ..."""
+    pose_sigma_rad: Positive = math.radians(0.5)
+    """... and of its attitude; for ``refine_poses`` alone."""
     workers: Annotated[int, Field(ge=1, le=64)] = 2
     """Threads that compute depth maps; the mesh does not depend on it."""
     external_patience_s: Annotated[float, Field(gt=0, le=60)] = 20.0
@@ -267,6 +273,10 @@ class Simulation(Settings):
     """Of a depth camera: standard deviation of a depth close by, ..."""
     depth_noise_per_m: NonNegative = 0.003
     """... and what is added to it for each square metre of the depth's square, 1/m: stereo and structured light."""
+    pose_noise_m: NonNegative = 0.0
+    """Standard deviation, on each axis, of the error of the position that is sent with a keyframe ..."""
+    pose_noise_rad: NonNegative = 0.0
+    """... and of its attitude. Independent from frame to frame; how the vehicles fly does not change."""
     start_patience_s: Positive = 120.0
     """How long the first tick waits for all drones; one that comes later joins in flight."""
 

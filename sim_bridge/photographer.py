@@ -1,20 +1,27 @@
-"""Takes the simulated drones' keyframes: when they are due, rendered, made noisy, and compressed as a camera would."""
+"""Takes the simulated drones' keyframes: when they are due, rendered, made noisy, and compressed as a camera would.
+
+The pose that is sent with one may be off, as that of a real vehicle is.
+"""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from PIL import Image
 
 from protocol.depth_image import encode_depth
-from protocol.geometry import Floats, camera_rotation
+from protocol.geometry import Floats, camera_rotation, turn_matrix
 from protocol.keyframe_rule import KeyframeRule, make_keyframe
 from protocol.messages import Keyframe
 from protocol.mission import Mission
 from sim_bridge.camera import Camera, add_depth_noise, add_noise
+
+POSE_STREAM: Final = 1
+"""Random numbers of poses are drawn apart, so that the images do not depend on them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,22 +60,32 @@ class Photographer:
             image = add_noise(image, self._mission.simulation.image_noise, generator)
         jpeg = io.BytesIO()
         Image.fromarray(image).save(jpeg, "JPEG", quality=settings.jpeg_quality)
-        pose = shot.pose
+        position, rotation = self._told_pose(shot)
         return make_keyframe(
             shot.drone,
             shot.sequence,
             shot.tick,
-            pose[:3],
-            camera_rotation(pose[3], pose[4]),
+            position,
+            rotation,
             self._intrinsics,
             jpeg.getvalue(),
-            self._measure(shot, generator),
+            self._measure_depth(shot, generator),
         )
 
-    def _measure(self, shot: Shot, generator: np.random.Generator) -> bytes:
+    def _measure_depth(self, shot: Shot, generator: np.random.Generator) -> bytes:
         """What a depth camera there gives; empty without one."""
         if self._depth_camera is None:
             return b""
         settings = self._mission.simulation
         depth = self._depth_camera.render_depth(shot.pose.tolist())
         return encode_depth(add_depth_noise(depth, settings.depth_noise_m, settings.depth_noise_per_m, generator))
+
+    def _told_pose(self, shot: Shot) -> tuple[Floats, Floats]:
+        """The true one, with an error of its own for each keyframe."""
+        settings = self._mission.simulation
+        position, rotation = shot.pose[:3], camera_rotation(shot.pose[3], shot.pose[4])
+        if settings.pose_noise_m == settings.pose_noise_rad == 0:
+            return position, rotation
+        dice = np.random.default_rng([self._mission.seed, shot.drone, shot.sequence, POSE_STREAM])
+        shift, turn = dice.normal(0.0, settings.pose_noise_m, 3), dice.normal(0.0, settings.pose_noise_rad, 3)
+        return position + shift, turn_matrix(turn) @ rotation

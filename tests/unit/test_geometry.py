@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.geometry import Intrinsics, camera_rotation, optical_axis
+from protocol.geometry import Intrinsics, camera_rotation, optical_axis, rotation_vector, turn_matrix
 
 yaws = st.floats(-10, 10)
 pitches = st.floats(-math.pi / 2, math.pi / 2)
@@ -85,3 +85,17 @@ def test_a_scaled_camera_sees_a_ray_at_the_same_share_of_its_image(width: int, h
     assert (scaled.width, scaled.height) == (width, height)
     assert (scaled.fx * x + scaled.cx) / width == pytest.approx((camera.fx * x + camera.cx) / 320)
     assert (scaled.fy * y + scaled.cy) / height == pytest.approx((camera.fy * y + camera.cy) / 180)
+
+
+@reproducible
+@given(vector=st.tuples(*[st.floats(-1.7, 1.7)] * 3))
+def test_a_turn_has_the_axis_and_angle_of_its_vector(vector: tuple[float, float, float]) -> None:
+    matrix = turn_matrix(np.array(vector))
+
+    assert matrix @ matrix.T == pytest.approx(np.eye(3), abs=1e-9)
+    assert matrix @ np.array(vector) == pytest.approx(vector, abs=1e-9)
+    assert rotation_vector(matrix) == pytest.approx(vector, abs=1e-6)
+
+
+def test_a_quarter_turn_about_z_takes_x_to_y() -> None:
+    assert turn_matrix(np.array([0, 0, math.pi / 2])) @ [1, 0, 0] == pytest.approx([0, 1, 0])
