@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, get_args
 
 import numpy as np
@@ -20,6 +20,7 @@ from ground_station.reconstruction.consistency import agreements
 from ground_station.reconstruction.depth_map import DepthEstimator, DepthMap
 from ground_station.reconstruction.depth_range import DepthRange, depth_range
 from ground_station.reconstruction.fusion import Volume
+from ground_station.reconstruction.pose_refiner import Pose, PoseRefiner
 from ground_station.reconstruction.reconstructor import Keyframe, Mesh, Outcome, Refusal, State, Statistics
 from ground_station.reconstruction.source_views import ViewIndex
 from ground_station.reconstruction.surface_nets import extract_mesh
@@ -28,6 +29,8 @@ from protocol.mission import Mission
 
 LOOK_AHEAD: Final = 3
 """Later keyframes of the same drone that a keyframe waits for; 3 x 0.12 m is the widest useful baseline."""
+FEATURE_WIDTH: Final = 320
+"""px: largest width of images in which poses are refined."""
 PATIENCE_S: Final = 3.0
 """Mission time after which a hovering drone's last keyframes are used without later ones."""
 RESWEPT: Final = 4 * LOOK_AHEAD
@@ -56,7 +59,10 @@ class _Entry:
     tick: int
     rank: int
     """Number of the drone's keyframes that were taken in before it."""
+    ticket: int
+    """Of the pose refiner."""
     view: View
+    """Posed as it was known when it was taken in, and then when its depth was begun."""
     color: NDArray[np.uint8]
     span: DepthRange
     sources: tuple[_Entry, ...] = ()
@@ -76,6 +82,7 @@ class PlaneSweepReconstructor:
         self._estimator = DepthEstimator(self._width, self._height, settings)
         self._pool = ThreadPoolExecutor(settings.workers, thread_name_prefix="depth")
         self._volume = Volume(mission.target, settings.voxel_m, settings.truncation_m)
+        self._refiner = _make_refiner(mission)
         self._index = ViewIndex(VIEWS_KEPT)
         self._kept: list[_Entry | None] = [None] * VIEWS_KEPT
         self._unswept: list[_Entry] = []
@@ -112,7 +119,7 @@ class PlaneSweepReconstructor:
             fused=self._fused,
             waiting=self._received - self._fused - self._refused.total(),
             refused=dict(self._refused),
-            memory_bytes=self._volume.size_bytes + kept,
+            memory_bytes=self._volume.size_bytes + kept + (self._refiner.size_bytes if self._refiner else 0),
         )
 
     @property
@@ -124,6 +131,7 @@ class PlaneSweepReconstructor:
         waiting = [*self._unswept, *(entry for entry, _ in self._unfused)]
         return {
             **self._volume.state(),
+            **(self._refiner.state() if self._refiner else {}),
             "waiting": np.array([(entry.drone, entry.tick) for entry in waiting], np.int64).reshape(-1, 2),
             "newest": np.array(sorted(self._newest.items()), np.int64).reshape(-1, 2),
             "fused": np.array(self._fused),
@@ -132,8 +140,10 @@ class PlaneSweepReconstructor:
 
     def restore(self, state: State, recent: Iterable[Keyframe]) -> None:
         self._volume.restore(state)
+        if self._refiner:
+            self._refiner.restore(state)
         for keyframe in recent:
-            self._admit(keyframe)
+            self._admit(keyframe, known=True)
         waiting = set(map(tuple, state["waiting"].tolist()))
         known = [entry for entry in self._unswept if (entry.drone, entry.tick) not in waiting]
         self._unswept = [entry for entry in self._unswept if (entry.drone, entry.tick) in waiting]
@@ -146,8 +156,8 @@ class PlaneSweepReconstructor:
         self._refused = +Counter(dict(zip(get_args(Refusal), state["refused"].tolist(), strict=True)))  # without zeros
         self._received = self._fused + self._refused.total() + len(self._unswept)
 
-    def _admit(self, keyframe: Keyframe) -> Outcome:
-        """Keep what later steps need of a keyframe, unless it is of no use."""
+    def _admit(self, keyframe: Keyframe, known: bool = False) -> Outcome:
+        """Keep what later steps need of a keyframe, unless it is of no use; ``known`` from before a restart."""
         self._received += 1
         color = shrink(keyframe.image, self._width, self._height)
         camera = keyframe.intrinsics.scaled_to(self._width, self._height)
@@ -163,7 +173,12 @@ class PlaneSweepReconstructor:
             return self._refuse(keyframe, "blurred")
         if span is None or span.nearest > self._settings.farthest_m or span.farthest < self._settings.nearest_m:
             return self._refuse(keyframe, "off_target")
-        entry = _Entry(keyframe.drone, keyframe.sequence, keyframe.tick, self._taken[keyframe.drone], view, color, span)
+        ticket = self._refine(keyframe, span, known)
+        if ticket is None:
+            return self._refuse(keyframe, "pose")
+        view = self._mended(view, ticket)
+        rank = self._taken[keyframe.drone]
+        entry = _Entry(keyframe.drone, keyframe.sequence, keyframe.tick, rank, ticket, view, color, span)
         self._taken[keyframe.drone] += 1
         self._newest[keyframe.drone] = keyframe.tick
         self._newest_grey[keyframe.drone] = view.grey
@@ -193,9 +208,29 @@ class PlaneSweepReconstructor:
         """Begin a depth map; None if there is nothing to compare with."""
         entry.sources = self._sources(entry.view, entry.span)
         if entry.sources:
-            views = [source.view for source in entry.sources]
+            entry.view = self._mended(entry.view, entry.ticket)
+            views = [self._mended(source.view, source.ticket) for source in entry.sources]
             entry.depth = self._pool.submit(self._estimator.estimate, entry.view, views, entry.span)
         return entry.depth
+
+    def _mended(self, view: View, ticket: int) -> View:
+        """With the pose that is known by now."""
+        pose = self._refiner.pose(ticket) if self._refiner else None
+        return replace(view, position=pose.position, rotation=pose.rotation) if pose else view
+
+    def _refine(self, keyframe: Keyframe, span: DepthRange, known: bool) -> int | None:
+        """The keyframe's ticket of the refiner, 0 if poses are not refined; None if its pose is wrong."""
+        if self._refiner is None:
+            return 0
+        height, width = self._refiner.size
+        same = keyframe.image.shape[:2] == self._refiner.size
+        grey = to_grey(keyframe.image if same else shrink(keyframe.image, width, height))
+        if known:
+            return self._refiner.recall(keyframe.drone, keyframe.tick, grey)
+        camera = keyframe.intrinsics.scaled_to(width, height)
+        depths = max(span.nearest, self._settings.nearest_m), min(span.farthest, self._settings.farthest_m)
+        pose = Pose(keyframe.position, keyframe.rotation)
+        return self._refiner.add(keyframe.drone, keyframe.tick, grey, camera, pose, depths)
 
     def _sources(self, view: View, span: DepthRange) -> tuple[_Entry, ...]:
         depth = min(TYPICAL_SHARE * span.typical, self._settings.farthest_m)
@@ -227,3 +262,12 @@ class PlaneSweepReconstructor:
         decided = tuple(self._decided)
         self._decided.clear()
         return decided
+
+
+def _make_refiner(mission: Mission) -> PoseRefiner | None:
+    settings, camera = mission.reconstruction, mission.camera
+    if not settings.refine_poses:
+        return None
+    width = min(FEATURE_WIDTH, camera.width_px)
+    height = round(width * camera.height_px / camera.width_px)
+    return PoseRefiner(VIEWS_KEPT, width, height, settings.pose_sigma_m, settings.pose_sigma_rad)

@@ -21,13 +21,14 @@ ROTATION_TOLERANCE: Final = 1e-4
 """Largest error of an entry of R R^T: float32 on the wire leaves 1e-6."""
 
 Refusal: TypeAlias = Literal[
-    "repeated", "featureless", "blurred", "off_target", "no_overlap", "no_depth", "wrong_scale", "unanswered"
+    "repeated", "featureless", "blurred", "off_target", "no_overlap", "no_depth", "wrong_scale", "unanswered", "pose"
 ]  # fmt: skip
 """``repeated``: not newer than the drone's last, or the same image again (a frozen camera would ruin the map).
 ``featureless``: black, white or covered. ``off_target``: looks past the box to be mapped. ``no_overlap``: no other
 keyframe shows the same place from a useful angle. ``no_depth``: compared, but no depth that two views agree on.
 ``wrong_scale``: its depths are all the same multiple of what others measured. ``unanswered``: given to an external
-process, of which no map with it came."""
+process, of which no map with it came. ``pose``: what it shows is not where its pose puts it, by more than noise
+explains (``refine_poses`` alone)."""
 
 State: TypeAlias = Mapping[str, NDArray[Any]]
 """What a reconstructor has to know again after a restart, beside its newest keyframes: arrays of its own choice."""

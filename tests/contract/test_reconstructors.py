@@ -11,18 +11,18 @@ import pytest
 from scipy.spatial import cKDTree
 
 from deploy.examples.external_map import PlaneSweepMap
-from faults.boxes import BOXES, LEG, fly_over, mission, share_right
+from faults.boxes import BOXES, LEG, REFINED, fly_over, mission, share_right
 from faults.external_process import served
 from ground_station.reconstruction.backends import make_reconstructor
 from ground_station.reconstruction.reconstructor import Keyframe, Mesh, Outcome, Reconstructor
 from protocol.errors import ReconstructionError
-from protocol.geometry import Floats, Intrinsics, camera_rotation
+from protocol.geometry import Floats, Intrinsics, camera_rotation, turn_matrix
 from protocol.mission import Target
 
 Make = Callable[[], Reconstructor]
 MAPPING = ("plane_sweep", "depth", "external")
 """Backends that make a map."""
-BACKENDS = (*MAPPING, "none")
+BACKENDS = (*MAPPING, "plane_sweep" + REFINED, "none")
 mapping = pytest.mark.parametrize("backend", MAPPING, indirect=True)
 
 
@@ -416,6 +416,68 @@ def test_views_whose_poses_are_wrong_are_kept_out_of_the_map(flight: list[Keyfra
     reconstructor = make_reconstructor(mission())
     assert set(reasons(fly(reconstructor, swapped)).values()) == {"no_depth"}
     assert reconstructor.statistics().fused < 3
+
+
+def misplaced(true: Keyframe, shift_m: float, turn_rad: float, seed: int = 4) -> Keyframe:
+    """With a pose that is off by so much, standard deviation of each axis; another for each keyframe."""
+    dice = np.random.default_rng([seed, true.drone, true.sequence])
+    turn = turn_matrix(dice.normal(0, turn_rad, 3))
+    return replace(true, position=true.position + dice.normal(0, shift_m, 3), rotation=turn @ true.rotation)
+
+
+def share_in_place(mesh: Mesh, expected: Mesh) -> float:
+    """Of the vertices, within 1.5 cm of those expected."""
+    distances, _ = cKDTree(expected.vertices).query(mesh.vertices)
+    return float(np.mean(distances < 0.015)) if len(distances) else 0.0
+
+
+def test_poses_that_are_a_little_wrong_are_mended(boxes: Mesh, flight: list[Keyframe]) -> None:
+    noisy = [misplaced(one, 0.02, np.radians(0.5)) for one in flight]
+    meshes = []
+    for backend in ("plane_sweep", "plane_sweep" + REFINED):
+        reconstructor = make_reconstructor(mission(backend))
+        fly(reconstructor, noisy)
+        meshes.append(reconstructor.mesh())
+    left, mended = meshes
+    assert len(mended.faces) > 1.5 * len(left.faces)
+    assert share_in_place(mended, boxes) > 0.6 > 3 * share_in_place(left, boxes)
+
+
+def test_exact_poses_are_left_as_they_are(boxes: Mesh, flight: list[Keyframe]) -> None:
+    reconstructor = make_reconstructor(mission("plane_sweep" + REFINED))
+    fly(reconstructor, flight)
+    mesh = reconstructor.mesh()
+    assert len(mesh.faces) == pytest.approx(len(boxes.faces), rel=0.03)
+    assert share_in_place(mesh, boxes) > 0.95
+
+
+def test_a_pose_that_cannot_be_mended_is_refused_and_does_not_spoil_the_map(
+    boxes: Mesh, flight: list[Keyframe]
+) -> None:
+    wrong = {12, 17, 22}
+    moved = np.array([0.25, -0.2, 0.1])
+    spoiled = [replace(one, position=one.position + moved) if n in wrong else one for n, one in enumerate(flight)]
+    reconstructor = make_reconstructor(mission("plane_sweep" + REFINED))
+    refused = {(one.drone, one.sequence) for one in fly(reconstructor, spoiled) if one.reason == "pose"}
+    assert refused == {(flight[n].drone, flight[n].sequence) for n in wrong}
+    assert reconstructor.statistics().refused == {"pose": len(wrong)}
+    assert share_in_place(reconstructor.mesh(), boxes) > 0.93
+
+
+def test_refined_poses_are_there_again_after_a_restart(flight: list[Keyframe]) -> None:
+    noisy = [misplaced(one, 0.02, np.radians(0.5)) for one in flight]
+    backend = "plane_sweep" + REFINED
+    old = make_reconstructor(mission(backend))
+    for start in range(0, 16, 2):
+        old.add(noisy[start : start + 2])
+    new = restart(old, lambda: make_reconstructor(mission(backend)), noisy[:16])
+    assert {name: array.tobytes() for name, array in new.state().items() if name.startswith("pose_")} == {
+        name: array.tobytes() for name, array in old.state().items() if name.startswith("pose_")
+    }
+    for reconstructor in (old, new):
+        fly(reconstructor, noisy[16:])
+    assert len(new.mesh().vertices) == pytest.approx(len(old.mesh().vertices), rel=0.02)
+    assert share_in_place(new.mesh(), old.mesh()) > 0.9
 
 
 def test_a_hovering_drone_does_not_keep_its_keyframes_waiting(flight: list[Keyframe]) -> None:

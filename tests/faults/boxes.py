@@ -18,15 +18,18 @@ SETTINGS = Reconstruction(
 )
 LEG = 14
 """Keyframes of one drone's flight over the boxes."""
+REFINED = ", poses refined"
+"""After a backend's name: with ``refine_poses``."""
 NEAR_M = 0.025
 """A voxel: so far from the surface a vertex is right."""
 
 
 def mission(backend: str = "plane_sweep", workers: int = 1) -> Mission:
+    changes = {"backend": backend.removesuffix(REFINED), "refine_poses": backend.endswith(REFINED), "workers": workers}
     return Mission(
         target=Target(lower_m=(-1, -1, 0), upper_m=(1, 1, 0.8)),
         camera=CAMERA,
-        reconstruction=SETTINGS.model_copy(update={"backend": backend, "workers": workers}),
+        reconstruction=SETTINGS.model_copy(update=changes),
         drones=(Drone(id=1, start=(0, 0, 2, 0, 1.4)),),
     )
 

@@ -24,6 +24,10 @@ def test_the_rehearsal_does_not_depend_on_the_mission_s_sizes() -> None:
     assert rehearse(Mission(drones=DRONES, camera=small, reconstruction=sweep)) > IMAGES / 2
 
 
+def test_the_refinement_of_poses_is_rehearsed_too() -> None:
+    assert rehearse(Mission(drones=DRONES, reconstruction=Reconstruction(refine_poses=True))) > IMAGES / 2
+
+
 def test_a_mission_without_a_map_is_rehearsed_too() -> None:
     assert rehearse(Mission(drones=DRONES, reconstruction=Reconstruction(backend="none"))) == IMAGES
 
