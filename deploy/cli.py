@@ -25,6 +25,7 @@ from deploy.reconstruct_command import reconstruct
 from deploy.recording_command import recording_app
 from deploy.replay_command import replay
 from deploy.traffic_command import traffic
+from deploy.train_command import train
 from protocol.errors import CovreconError, CredentialsError, MissionError, SceneError
 from protocol.guard import require_own_packages
 from protocol.verbs import Verb
@@ -53,6 +54,7 @@ app.command(evaluate)
 app.command(reconstruct)
 app.command(doctor)
 app.command(traffic)
+app.command(train)
 app.command(completion_of(app), name="completion")
 
 MissionPath = Annotated[Path, Parameter(help="Mission file (TOML).")]
@@ -227,9 +229,11 @@ def check(mission: MissionPath, /, *, drones: TeamSize = None) -> None:
 
     Example: covrecon mission check workshop.toml --drones 4
     """
+    from ground_station.reconstruction.backends import require_backend
     from protocol.mission_file import load_mission
 
     checked = load_mission(mission, drones=drones)
+    require_backend(checked)
     print(f"{mission}: {checked.name} is ready to fly, drones: {len(checked.drones)}")
 
 

@@ -76,6 +76,19 @@ install_browser() {
 # Network namespaces, in which one machine stands for many; for root alone.
 install_hosts() { PATH=$PATH:/sbin:/usr/sbin command -v ip >/dev/null || install_wished iproute2 "many hosts"; }
 
+# Torch is for tests of the learned reconstructor, and comes only where it is found built for the CPU, 200 MB.
+install_torch() {
+    local tool=(.venv/bin/python -m pip install --disable-pip-version-check) found
+    if command -v uv >/dev/null; then
+        tool=(uv pip install --python .venv/bin/python)
+    fi
+    tool+=(--constraint constraints.txt --editable '.[learned]')
+    if found=$("${tool[@]}" --dry-run 2>&1) && ! grep -Eqi 'nvidia|cuda' <<<"$found"; then
+        "${tool[@]}" --quiet && return
+    fi
+    echo "install: no torch for the CPU alone: tests of the learned reconstructor are left out"
+}
+
 # $1: python, then what to install.
 install_packages() {
     local python=$1
@@ -111,6 +124,7 @@ if [[ ${1:-} == tests ]]; then
     install_hosts
     echo "install: test tools, about 1 GB more"
     install_packages "$python" --editable '.[ground,camera]' --group dev
+    install_torch
 else
     echo "install: about 1 GB into .venv, once; a few minutes"
     install_packages "$python" --editable '.[ground,camera]'

@@ -15,6 +15,7 @@ from deploy.local import SETTLE_S, Role, mission_roles, supervise
 from deploy.outcome import describe, read_outcome
 from deploy.progress import Display, follow
 from deploy.run_folder import make_run_folder, socket_endpoint, socket_folder_parent
+from ground_station.reconstruction.backends import require_backend
 from ground_station.rehearsal import rehearse
 from protocol.errors import ProcessError
 from protocol.importance import compile_kernels
@@ -47,6 +48,7 @@ def fly(
     ``with_autopilots``: also start PX4-like vehicles of our own. ``with_console``: and the page in the browser.
     ``mapper``: and this command, which makes the map.
     """
+    require_backend(mission)
     with TemporaryDirectory(prefix="covrecon-", dir=socket_folder_parent(), ignore_cleanup_errors=True) as private:
         endpoint = mission.transport.endpoint or socket_endpoint(Path(private))
         run = make_run_folder(out, mission, started, endpoint)

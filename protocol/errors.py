@@ -16,6 +16,7 @@
     |-- CommandError        an operator's command that was refused, or that not everybody has acknowledged
     |-- VehicleError        a vehicle that cannot be connected, is not fit to fly, or refuses what it is told
     |-- ReconstructionError input that the reconstructor cannot work with
+    |-- TrainingError       settings, rooms or weights of the learned reconstructor that do not fit
     `-- ProcessError        a process of the run that failed
 
 Errors of zenoh, MAVSDK, OSQP, Open3D and the like are mapped to these at the edge where they arise. Outcomes of the
@@ -92,6 +93,10 @@ class VehicleError(CovreconError):
 
 
 class ReconstructionError(CovreconError):
+    pass
+
+
+class TrainingError(CovreconError):
     pass
 
 

@@ -233,11 +233,20 @@ class Camera(Settings):
         return Intrinsics.from_field_of_view(self.width_px, self.height_px, self.horizontal_fov_rad)
 
 
+class Learned(Settings):
+    """For the backend "learned" alone."""
+
+    weights: str = ""
+    """Path of a safetensors file that `covrecon train` wrote, relative to the mission file; empty: those that come with
+    this release."""
+
+
 class Reconstruction(Settings):
     """Images to mesh; docs/adr/0004 has the measurements behind it."""
 
-    backend: Literal["plane_sweep", "depth", "external", "none"] = "plane_sweep"
-    """"plane_sweep": depth from images; "depth": that of depth cameras; "external": a process of your own makes the map
+    backend: Literal["plane_sweep", "depth", "learned", "external", "none"] = "plane_sweep"
+    """"plane_sweep": depth from images; "depth": that of depth cameras; "learned": a network's, which takes the extra
+    of that name and has voxels of its own, 4 cm (docs/learned.md); "external": a process of your own makes the map
     (docs/external-reconstructor.md)."""
     sweep_width_px: Annotated[int, Field(ge=32, le=1024)] = 128
     """Width at which depth is computed, or measured by a depth camera; the height follows from the camera."""
@@ -258,6 +267,7 @@ class Reconstruction(Settings):
     """Threads that compute depth maps; the mesh does not depend on it."""
     external_patience_s: Annotated[float, Field(gt=0, le=60)] = 20.0
     """Wall time that a flight in lockstep waits for an external process's map, at each update and at the end."""
+    learned: Learned = Learned()
 
 
 class Simulation(Settings):

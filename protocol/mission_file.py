@@ -30,9 +30,9 @@ def load_mission(
     """Read and check a mission: TOML, or JSON as `mission_to_json` writes it (``.json``).
 
     ``drones`` sets the team's size: the file's first drones, then more placed by `protocol.formation`. ``seed``
-    replaces the file's, and ``replaced`` any others, by dotted name (``vehicles.kind``). A scene, a camera or a folder
-    of certificates given as a path becomes absolute, so that the mission may be stored elsewhere. Raises `MissionError`
-    with one fault a line.
+    replaces the file's, and ``replaced`` any others, by dotted name (``vehicles.kind``). A scene, a camera, weights or
+    a folder of certificates given as a path becomes absolute, so that the mission may be stored elsewhere. Raises
+    `MissionError` with one fault a line.
     """
     raw, lines = _parse(path, _read(path))
     if seed is not None:
@@ -42,6 +42,7 @@ def load_mission(
     _resolve_scene(raw, path.parent)
     _resolve_cameras(raw, path.parent)
     _resolve_credentials(raw, path.parent)
+    _resolve_weights(raw, path.parent)
     faults = _complete_team(raw, drones)
     mission, found = check(raw)
     faults += [fault for fault in found if fault.path not in {known.path for known in faults}]
@@ -139,6 +140,14 @@ def _resolve_credentials(raw: dict[str, Any], folder: Path) -> None:
     credentials = table.get("credentials") if isinstance(table, dict) else None
     if isinstance(table, dict) and isinstance(credentials, str) and credentials:
         table["credentials"] = str((folder / Path(credentials).expanduser()).resolve())
+
+
+def _resolve_weights(raw: dict[str, Any], folder: Path) -> None:
+    table = raw.get("reconstruction")
+    learned = table.get("learned") if isinstance(table, dict) else None
+    weights = learned.get("weights") if isinstance(learned, dict) else None
+    if isinstance(learned, dict) and isinstance(weights, str) and weights:
+        learned["weights"] = str((folder / Path(weights).expanduser()).resolve())
 
 
 def _complete_team(raw: dict[str, Any], drones: int | None) -> list[Fault]:

@@ -74,6 +74,8 @@ def _part_of(mission: Mission, drone: int) -> Mission:
 
 def _needed_sets(mission: Mission, drone: int) -> dict[str, str]:
     needed = {} if drone else {"ground": "the ground station, the simulator and reports need it"}
+    if not drone and mission.reconstruction.backend == "learned":
+        needed["learned"] = 'the mission says reconstruction.backend = "learned"'
     if any(drone.camera for drone in mission.drones):
         needed["camera"] = "the mission has real cameras"
     return needed

@@ -2,20 +2,35 @@
 
 from __future__ import annotations
 
+from importlib import import_module
+from pathlib import Path
+from typing import cast
+
 from ground_station.external_map import ExternalMap
 from ground_station.reconstruction.depth_reconstructor import DepthReconstructor
 from ground_station.reconstruction.external_reconstructor import ExternalReconstructor
+from ground_station.reconstruction.learned.requirements import require_torch
 from ground_station.reconstruction.plane_sweep_reconstructor import PlaneSweepReconstructor
 from ground_station.reconstruction.reconstructor import NullReconstructor, Reconstructor
 from protocol.errors import ReconstructionError
 from protocol.mission import Mission
 
 
+def require_backend(mission: Mission) -> None:
+    """Asked before a flight. Raises `ReconstructionError` if what the mission's method needs is not on this computer."""
+    if mission.reconstruction.backend == "learned":
+        require_torch()
+        weights = mission.reconstruction.learned.weights
+        if weights and not Path(weights).is_file():
+            raise ReconstructionError(f"reconstruction.learned.weights: {weights} is not a file")
+
+
 def make_reconstructor(mission: Mission, external: ExternalMap | None = None) -> Reconstructor:
     """A new, empty one; ``external``: the process that a mission with that backend flies with.
 
     Raises:
-        ReconstructionError: the map would not fit in memory, or is another process's that is not here.
+        ReconstructionError: the map would not fit in memory, is another process's that is not here, or its method
+            lacks what it needs.
     """
     match mission.reconstruction.backend:
         case "none":
@@ -28,5 +43,9 @@ def make_reconstructor(mission: Mission, external: ExternalMap | None = None) ->
             raise ReconstructionError(
                 'reconstruction.backend "external": that process makes its map in flight alone; choose another one here'
             )
+        case "learned":
+            # By name: it imports torch, which only missions that ask for it need.
+            learned = import_module("ground_station.reconstruction.learned.learned_reconstructor")
+            return cast("Reconstructor", learned.LearnedReconstructor(mission))
         case "plane_sweep":
             return PlaneSweepReconstructor(mission)

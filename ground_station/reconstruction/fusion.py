@@ -120,6 +120,56 @@ class Volume:
             np.float32(self.truncation),
         )
 
+    def blend(
+        self,
+        first: tuple[int, int, int],
+        distance: NDArray[np.float32],
+        weight: NDArray[np.float32],
+        color: NDArray[np.uint8],
+    ) -> None:
+        """Average in a block of voxels (X, Y, Z) from voxel ``first`` on; what reaches beyond the volume is left out.
+
+        ``distance`` as in the volume, ``weight`` 0 for what is not known, ``color`` (X, Y, Z, 3), black for no colour.
+        """
+        size = [
+            min(count, have - low) for count, have, low in zip(distance.shape, self.distance.shape, first, strict=True)
+        ]
+        here = tuple(slice(low, low + count) for low, count in zip(first, size, strict=True))
+        block = tuple(slice(count) for count in size)
+        _blend(self.distance[here], self.weight[here], self.color[here], distance[block], weight[block], color[block])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _blend(
+    distance: NDArray[np.float32],
+    total_weight: NDArray[np.float32],
+    total_color: NDArray[np.uint8],
+    new_distance: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    color: NDArray[np.uint8],
+) -> None:
+    for i in range(distance.shape[0]):
+        for j in range(distance.shape[1]):
+            for k in range(distance.shape[2]):
+                gain = weight[i, j, k]
+                if gain <= np.float32(0):
+                    continue
+                old = total_weight[i, j, k]
+                share = gain / (old + gain)
+                distance[i, j, k] += (new_distance[i, j, k] - distance[i, j, k]) * share
+                total_weight[i, j, k] = min(old + gain, np.float32(WEIGHT_MAX))
+                if color[i, j, k].any():
+                    _tint(total_color[i, j, k], color[i, j, k], share)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _tint(total: NDArray[np.uint8], color: NDArray[np.uint8], share: np.float32) -> None:
+    # Black is the colour of a voxel that so far was only seen through.
+    blend = share if total[0] or total[1] or total[2] else np.float32(1)
+    for channel in range(3):
+        kept = np.float32(total[channel])
+        total[channel] = np.uint8(kept + (np.float32(color[channel]) - kept) * blend + np.float32(0.5))
+
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _cut(first: float, last: float, constant: float, slope: float) -> tuple[float, float]:

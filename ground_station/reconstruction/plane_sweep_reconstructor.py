@@ -16,15 +16,16 @@ from typing import Final, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from ground_station.reconstruction.admission import Admission
 from ground_station.reconstruction.consistency import agreements
 from ground_station.reconstruction.depth_map import DepthEstimator, DepthMap
-from ground_station.reconstruction.depth_range import DepthRange, depth_range
+from ground_station.reconstruction.depth_range import DepthRange
 from ground_station.reconstruction.fusion import Volume
 from ground_station.reconstruction.pose_refiner import Pose, PoseRefiner
 from ground_station.reconstruction.reconstructor import Keyframe, Mesh, Outcome, Refusal, State, Statistics
 from ground_station.reconstruction.source_views import ViewIndex
 from ground_station.reconstruction.surface_nets import extract_mesh
-from ground_station.reconstruction.views import CONTRAST_MIN, SHARPNESS_MIN, View, contrast, sharpness, shrink, to_grey
+from ground_station.reconstruction.views import View, shrink, to_grey
 from protocol.mission import Mission
 
 LOOK_AHEAD: Final = 3
@@ -75,7 +76,6 @@ class PlaneSweepReconstructor:
     def __init__(self, mission: Mission) -> None:
         settings = mission.reconstruction
         self._settings = settings
-        self._box = mission.target
         self._width = settings.sweep_width_px
         self._height = round(settings.sweep_width_px * mission.camera.height_px / mission.camera.width_px)
         self._patience = round(PATIENCE_S / mission.tick_s)
@@ -90,8 +90,7 @@ class PlaneSweepReconstructor:
         self._due: list[tuple[_Entry, Future[DepthMap]]] = []
         self._decided: list[Outcome] = []
         self._taken: Counter[int] = Counter()
-        self._newest: dict[int, int] = {}  # tick
-        self._newest_grey: dict[int, NDArray[np.uint8]] = {}
+        self._admission = Admission(mission)
         self._received = 0
         self._fused = 0
         self._refused: Counter[Refusal] = Counter()
@@ -133,7 +132,7 @@ class PlaneSweepReconstructor:
             **self._volume.state(),
             **(self._refiner.state() if self._refiner else {}),
             "waiting": np.array([(entry.drone, entry.tick) for entry in waiting], np.int64).reshape(-1, 2),
-            "newest": np.array(sorted(self._newest.items()), np.int64).reshape(-1, 2),
+            "newest": self._admission.state(),
             "fused": np.array(self._fused),
             "refused": np.array([self._refused[reason] for reason in get_args(Refusal)]),
         }
@@ -151,7 +150,7 @@ class PlaneSweepReconstructor:
             if self._taken[entry.drone] - entry.rank <= RESWEPT:
                 self._sweep(entry)
                 entry.sources = ()
-        self._newest.update(state["newest"].tolist())
+        self._admission.restore(state["newest"])
         self._fused = int(state["fused"])
         self._refused = +Counter(dict(zip(get_args(Refusal), state["refused"].tolist(), strict=True)))  # without zeros
         self._received = self._fused + self._refused.total() + len(self._unswept)
@@ -162,17 +161,9 @@ class PlaneSweepReconstructor:
         color = shrink(keyframe.image, self._width, self._height)
         camera = keyframe.intrinsics.scaled_to(self._width, self._height)
         view = View(to_grey(color), keyframe.position, keyframe.rotation, camera)
-        span = depth_range(view, self._box, self._settings.truncation_m)
-        last = self._newest_grey.get(keyframe.drone)
-        is_old = keyframe.tick <= self._newest.get(keyframe.drone, -1)
-        if is_old or (last is not None and np.array_equal(view.grey, last)):
-            return self._refuse(keyframe, "repeated")
-        if contrast(view.grey) < CONTRAST_MIN:
-            return self._refuse(keyframe, "featureless")
-        if sharpness(view.grey) < SHARPNESS_MIN:
-            return self._refuse(keyframe, "blurred")
-        if span is None or span.nearest > self._settings.farthest_m or span.farthest < self._settings.nearest_m:
-            return self._refuse(keyframe, "off_target")
+        span = self._admission.examine(keyframe, view)
+        if isinstance(span, str):
+            return self._refuse(keyframe, span)
         ticket = self._refine(keyframe, span, known)
         if ticket is None:
             return self._refuse(keyframe, "pose")
@@ -180,15 +171,13 @@ class PlaneSweepReconstructor:
         rank = self._taken[keyframe.drone]
         entry = _Entry(keyframe.drone, keyframe.sequence, keyframe.tick, rank, ticket, view, color, span)
         self._taken[keyframe.drone] += 1
-        self._newest[keyframe.drone] = keyframe.tick
-        self._newest_grey[keyframe.drone] = view.grey
         self._kept[self._index.add(view)] = entry
         self._unswept.append(entry)
         return Outcome(keyframe.drone, keyframe.sequence, "waiting")
 
     def _schedule(self, everything: bool = False) -> None:
         """Begin the depth maps that are due, and note what can be fused once they are there."""
-        now = max(self._newest.values(), default=0)
+        now = max(self._admission.newest.values(), default=0)
 
         def is_due(entry: _Entry, stages: int) -> bool:
             followed = self._taken[entry.drone] - 1 - entry.rank >= stages * LOOK_AHEAD

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from deploy.examples.external_map import PlaneSweepMap
 from faults.boxes import BOXES, LEG, REFINED, fly_over, mission, share_right
 from faults.external_process import served
 from ground_station.reconstruction.backends import make_reconstructor
+from ground_station.reconstruction.learned.requirements import MODULES
 from ground_station.reconstruction.reconstructor import Keyframe, Mesh, Outcome, Reconstructor
 from protocol.errors import ReconstructionError
 from protocol.geometry import Floats, Intrinsics, camera_rotation, turn_matrix
@@ -22,7 +24,13 @@ from protocol.mission import Target
 Make = Callable[[], Reconstructor]
 MAPPING = ("plane_sweep", "depth", "external")
 """Backends that make a map."""
-BACKENDS = (*MAPPING, "plane_sweep" + REFINED, "none")
+LEARNED = pytest.param(
+    "learned",
+    marks=pytest.mark.skipif(
+        any(find_spec(name) is None for name in MODULES), reason="the extra learned is not installed"
+    ),
+)
+BACKENDS = (*MAPPING, "plane_sweep" + REFINED, LEARNED, "none")
 mapping = pytest.mark.parametrize("backend", MAPPING, indirect=True)
 
 

@@ -1,0 +1,184 @@
+"""The reconstructor that has learnt what rooms look like: fragments of keyframes through a network, into the volume.
+
+Every few keyframes of a drone become a fragment, with the newest keyframes of the team that show the same place, and
+what the network says of it is averaged into the map. What is done when depends on the keyframes given alone.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, get_args
+
+import numpy as np
+
+from ground_station.reconstruction.admission import Admission
+from ground_station.reconstruction.fusion import Volume
+from ground_station.reconstruction.learned.fragment import (
+    FINE_M,
+    REACH_M,
+    VIEWS_MIN,
+    choose_views,
+    middle_of,
+    place_window,
+    projection,
+    seen_points,
+    shows,
+)
+from ground_station.reconstruction.learned.prediction import Photograph, Predictor
+from ground_station.reconstruction.learned.weights import SHIPPED, load_network
+from ground_station.reconstruction.reconstructor import Keyframe, Mesh, Outcome, Refusal, State, Statistics
+from ground_station.reconstruction.surface_nets import extract_mesh
+from ground_station.reconstruction.views import View, shrink, to_grey
+from protocol.mission import Mission
+
+GROUP: Final = 4
+"""Keyframes of one drone from which a fragment is made: half a metre of its path, a fifth of what a window shows."""
+PATIENCE_S: Final = 3.0
+"""Mission time after which a hovering drone's last keyframes are used without later ones."""
+KEPT: Final = 128
+"""Newest keyframes that a fragment is chosen from; with their features 85 MB."""
+WEIGHT_MIN: Final = 0.4
+"""Weight from which a voxel is part of the map: one fragment of eight views that is sure of it, or two of four."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Entry:
+    drone: int
+    sequence: int
+    tick: int
+    view: View
+    photograph: Photograph
+
+
+class LearnedReconstructor:
+    """Implements `reconstructor.Reconstructor`."""
+
+    def __init__(self, mission: Mission) -> None:
+        """Raises `ReconstructionError` without torch, or if the mission's weights do not fit."""
+        settings = mission.reconstruction
+        self._predictor = Predictor(
+            load_network(Path(settings.learned.weights) if settings.learned.weights else SHIPPED)
+        )
+        self._box = mission.target
+        self._width = settings.sweep_width_px
+        self._height = round(settings.sweep_width_px * mission.camera.height_px / mission.camera.width_px)
+        self._size = self._predictor.size(mission.camera.width_px, mission.camera.height_px)
+        self._patience = round(PATIENCE_S / mission.tick_s)
+        self._volume = Volume(mission.target, FINE_M, REACH_M)
+        self._admission = Admission(mission)
+        self._kept: deque[_Entry] = deque(maxlen=KEPT)
+        self._waiting: dict[int, list[_Entry]] = {}
+        self._decided: list[Outcome] = []
+        self._received = 0
+        self._fused = 0
+        self._refused: Counter[Refusal] = Counter()
+
+    def add(self, keyframes: Sequence[Keyframe]) -> tuple[Outcome, ...]:
+        outcomes = []
+        for keyframe in keyframes:
+            outcomes.append(self._admit(keyframe))
+            if len(self._waiting.get(keyframe.drone, ())) >= GROUP:
+                self._reconstruct(keyframe.drone)
+        now = max(self._admission.newest.values(), default=0)
+        for drone, entries in sorted(self._waiting.items()):
+            if entries and now - entries[0].tick >= self._patience:
+                self._reconstruct(drone)
+        return (*outcomes, *self._take_decided())
+
+    def flush(self) -> tuple[Outcome, ...]:
+        for drone in sorted(self._waiting):
+            self._reconstruct(drone)
+        return self._take_decided()
+
+    def mesh(self) -> Mesh:
+        return extract_mesh(self._volume, WEIGHT_MIN)
+
+    def statistics(self) -> Statistics:
+        return Statistics(
+            received=self._received,
+            fused=self._fused,
+            waiting=self._received - self._fused - self._refused.total(),
+            refused=dict(self._refused),
+            memory_bytes=self._volume.size_bytes + sum(entry.photograph.size_bytes for entry in self._kept),
+        )
+
+    @property
+    def lookback(self) -> int:
+        return KEPT
+
+    def state(self) -> State:
+        waiting = [(entry.drone, entry.tick) for entries in self._waiting.values() for entry in entries]
+        return {
+            **self._volume.state(),
+            "waiting": np.array(waiting, np.int64).reshape(-1, 2),
+            "newest": self._admission.state(),
+            "fused": np.array(self._fused),
+            "refused": np.array([self._refused[reason] for reason in get_args(Refusal)]),
+        }
+
+    def restore(self, state: State, recent: Iterable[Keyframe]) -> None:
+        self._volume.restore(state)
+        for keyframe in recent:
+            self._admit(keyframe)
+        waiting = set(map(tuple, state["waiting"].tolist()))
+        for drone, entries in self._waiting.items():
+            self._waiting[drone] = [entry for entry in entries if (drone, entry.tick) in waiting]
+        self._admission.restore(state["newest"])
+        self._fused = int(state["fused"])
+        self._refused = +Counter(dict(zip(get_args(Refusal), state["refused"].tolist(), strict=True)))  # without zeros
+        self._received = self._fused + self._refused.total() + sum(map(len, self._waiting.values()))
+
+    def _admit(self, keyframe: Keyframe) -> Outcome:
+        """Keep what later steps need of a keyframe, unless it is of no use."""
+        self._received += 1
+        color = shrink(keyframe.image, self._width, self._height)
+        camera = keyframe.intrinsics.scaled_to(self._width, self._height)
+        view = View(to_grey(color), keyframe.position, keyframe.rotation, camera)
+        span = self._admission.examine(keyframe, view)
+        if isinstance(span, str):
+            return self._refuse(keyframe, span)
+        photograph = self._predictor.look(shrink(keyframe.image, *self._size))
+        entry = _Entry(keyframe.drone, keyframe.sequence, keyframe.tick, view, photograph)
+        self._kept.append(entry)
+        self._waiting.setdefault(keyframe.drone, []).append(entry)
+        return Outcome(keyframe.drone, keyframe.sequence, "waiting")
+
+    def _reconstruct(self, drone: int) -> None:
+        """Make a fragment of what waits of a drone, and of the team's newest that show what its newest shows."""
+        group = self._waiting.pop(drone, [])
+        if not group:
+            return
+        newest = group[-1]
+        entries = [newest, *(entry for entry in reversed(self._kept) if entry is not newest)]
+        fragment = [entries[place] for place in choose_views([entry.view for entry in entries], self._box)]
+        if len(fragment) < VIEWS_MIN:
+            self._decided += [self._refuse(entry, "no_overlap") for entry in group]
+            return
+        views = [entry.view for entry in fragment]
+        window = place_window(middle_of(views, self._box), self._volume.origin, self._volume.distance.shape)
+        corner = self._volume.origin + FINE_M * np.array(window.first)
+        projections = np.stack([projection(view) for view in views])
+        block = self._predictor.predict([entry.photograph for entry in fragment], projections, corner, window)
+        if not block.surface:
+            self._decided += [self._refuse(entry, "no_depth") for entry in group]
+            return
+        self._volume.blend(window.first, block.distance, block.weight, block.color)
+        shown = shows([entry.view for entry in group], seen_points(newest.view, self._box))
+        for entry, is_part in zip(group, shown.tolist(), strict=True):
+            if is_part or entry is newest:
+                self._fused += 1
+                self._decided.append(Outcome(entry.drone, entry.sequence, "fused"))
+            else:
+                self._decided.append(self._refuse(entry, "no_overlap"))
+
+    def _refuse(self, keyframe: Keyframe | _Entry, reason: Refusal) -> Outcome:
+        self._refused[reason] += 1
+        return Outcome(keyframe.drone, keyframe.sequence, "refused", reason)
+
+    def _take_decided(self) -> tuple[Outcome, ...]:
+        decided = tuple(self._decided)
+        self._decided.clear()
+        return decided

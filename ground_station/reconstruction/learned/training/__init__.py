@@ -1,0 +1,1 @@
+"""How the network learns: from random furnished rooms that the simulator writes (``covrecon train``)."""
