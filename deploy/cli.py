@@ -229,7 +229,7 @@ def check(mission: MissionPath, /, *, drones: TeamSize = None) -> None:
 
     Example: covrecon mission check workshop.toml --drones 4
     """
-    from ground_station.reconstruction.backends import require_backend
+    from ground_station.reconstruction.learned.requirements import require_backend
     from protocol.mission_file import load_mission
 
     checked = load_mission(mission, drones=drones)

@@ -15,7 +15,7 @@ from deploy.local import SETTLE_S, Role, mission_roles, supervise
 from deploy.outcome import describe, read_outcome
 from deploy.progress import Display, follow
 from deploy.run_folder import make_run_folder, socket_endpoint, socket_folder_parent
-from ground_station.reconstruction.backends import require_backend
+from ground_station.reconstruction.learned.requirements import require_backend
 from ground_station.rehearsal import rehearse
 from protocol.errors import ProcessError
 from protocol.importance import compile_kernels

@@ -3,26 +3,15 @@
 from __future__ import annotations
 
 from importlib import import_module
-from pathlib import Path
 from typing import cast
 
 from ground_station.external_map import ExternalMap
 from ground_station.reconstruction.depth_reconstructor import DepthReconstructor
 from ground_station.reconstruction.external_reconstructor import ExternalReconstructor
-from ground_station.reconstruction.learned.requirements import require_torch
 from ground_station.reconstruction.plane_sweep_reconstructor import PlaneSweepReconstructor
 from ground_station.reconstruction.reconstructor import NullReconstructor, Reconstructor
 from protocol.errors import ReconstructionError
 from protocol.mission import Mission
-
-
-def require_backend(mission: Mission) -> None:
-    """Asked before a flight. Raises `ReconstructionError` if what the mission's method needs is not on this computer."""
-    if mission.reconstruction.backend == "learned":
-        require_torch()
-        weights = mission.reconstruction.learned.weights
-        if weights and not Path(weights).is_file():
-            raise ReconstructionError(f"reconstruction.learned.weights: {weights} is not a file")
 
 
 def make_reconstructor(mission: Mission, external: ExternalMap | None = None) -> Reconstructor:

@@ -1,4 +1,4 @@
-"""How keyframes become a fragment and where its window lies, and how blocks are averaged into the map: without torch."""
+"""How keyframes become a fragment, where its window lies, and how blocks are averaged into the map: without torch."""
 
 from __future__ import annotations
 

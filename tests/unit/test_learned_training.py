@@ -1,4 +1,4 @@
-"""What the learned reconstructor learns from, that a resumed training learns the same, and which weights are refused."""
+"""What the learned reconstructor learns from, that a resumed training learns the same, which weights are refused."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from deploy.doctor.examination import _needed_sets
-from ground_station.reconstruction import backends
 from ground_station.reconstruction.learned import requirements
 from ground_station.reconstruction.learned.fragment import FINE_M, REACH_M
 from ground_station.reconstruction.learned.training.folder import begin, missing_rooms, read_settings, room_path
@@ -231,8 +230,8 @@ def asked(weights: str = "") -> Mission:
 def test_a_mission_without_torch_fails_before_the_flight_and_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(requirements, "find_spec", lambda name: None if name == "torch" else find_spec(name))
     with pytest.raises(ReconstructionError, match=r"torch: run \.venv/bin/pip install -e '\.\[learned\]'"):
-        backends.require_backend(asked())
-    backends.require_backend(replace_backend(asked(), "plane_sweep"))
+        requirements.require_backend(asked())
+    requirements.require_backend(replace_backend(asked(), "plane_sweep"))
     assert "learned" in _needed_sets(asked(), 0)
     assert "learned" not in _needed_sets(asked(), 1), "a drone needs no network"
 
@@ -242,7 +241,7 @@ def test_a_mission_whose_weights_are_not_there_fails_before_the_flight(
 ) -> None:
     monkeypatch.setattr(requirements, "find_spec", lambda _: object())
     with pytest.raises(ReconstructionError, match=r"weights: .*none\.safetensors is not a file"):
-        backends.require_backend(asked(str(tmp_path / "none.safetensors")))
+        requirements.require_backend(asked(str(tmp_path / "none.safetensors")))
 
 
 def replace_backend(mission: Mission, backend: str) -> Mission:
