@@ -210,5 +210,5 @@ def to_coarse(
     x, y, z = (size // COARSE for size in distance.shape)
     shape = (x, COARSE, y, COARSE, z, COARSE)
     mean: NDArray[np.float32] = distance.reshape(shape).mean(axis=(1, 3, 5))
-    near: NDArray[np.bool_] = occupied.reshape(shape).any(axis=(1, 3, 5))
+    near = np.asarray(occupied.reshape(shape).any(axis=(1, 3, 5)))
     return mean, near
