@@ -15,17 +15,19 @@ from torch.nn import functional
 
 from ground_station.reconstruction.learned.fragment import COARSE, FINE_M, NEAREST_M
 
-ARCHITECTURE: Final = "dense-2-level/1"
+ARCHITECTURE: Final = "dense-2-level/2"
 """Changes with everything that makes old weights useless, also with the meaning of inputs and outputs."""
 
 IMAGE_WIDTH: Final = 256
 """Pixels; photographs are brought to this width, and to a height that is a multiple of `IMAGE_STEP`."""
 IMAGE_STEP: Final = 8
 """The image net halves three times."""
-QUARTER: Final = 16
+SHOWN: Final = 4
+"""Colours and local contrast."""
+QUARTER: Final = 20
 """Features of the quarter-size map, which fill the coarse volume ..."""
-HALF: Final = 8
-"""... and of the half-size map, which refine."""
+HALF: Final = 12
+"""... and of the half-size map, which refine; with what is shown in both."""
 IMAGE_WIDTHS: Final = (16, 24, 32)
 VOLUME_WIDTHS: Final = (24, 40, 64)
 REFINED_WIDTH: Final = 48
@@ -97,21 +99,26 @@ class ImageNet(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         first, second, third = IMAGE_WIDTHS
-        self.down1 = nn.Sequential(_flat(4, first, 2), _flat(first, first))
+        self.down1 = nn.Sequential(_flat(SHOWN, first, 2), _flat(first, first))
         self.down2 = nn.Sequential(_flat(first, second, 2), _flat(second, second))
         self.down3 = nn.Sequential(_flat(second, third, 2), _flat(third, third))
         self.from3 = nn.Conv2d(third, second, 1)
-        self.to_quarter = nn.Conv2d(second, QUARTER, 3, 1, 1)
+        self.to_quarter = nn.Conv2d(second, QUARTER - SHOWN, 3, 1, 1)
         self.from2 = nn.Conv2d(second, first, 1)
-        self.to_half = nn.Conv2d(first, HALF, 3, 1, 1)
+        self.to_half = nn.Conv2d(first, HALF - SHOWN, 3, 1, 1)
 
     def forward(self, images: Tensor) -> Features:
         """``images`` (V, 3, H, W) in [0, 1], both sides multiples of `IMAGE_STEP`."""
-        half = self.down1(torch.cat([2 * images - 1, local_contrast(images)], dim=1))
+        shown = torch.cat([2 * images - 1, local_contrast(images)], dim=1)
+        half = self.down1(shown)
         quarter = self.down2(half)
         quarter = quarter + functional.interpolate(self.from3(self.down3(quarter)), scale_factor=2.0)
         half = half + functional.interpolate(self.from2(quarter), scale_factor=2.0)
-        return Features(self.to_quarter(quarter), self.to_half(half))
+        # What is seen is passed on beside what is learnt: where views agree on it, there may be a surface.
+        return Features(
+            torch.cat([self.to_quarter(quarter), functional.avg_pool2d(shown, 4)], dim=1),
+            torch.cat([self.to_half(half), functional.avg_pool2d(shown, 2)], dim=1),
+        )
 
 
 def local_contrast(images: Tensor) -> Tensor:

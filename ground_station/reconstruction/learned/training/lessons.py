@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import zipfile
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,6 +29,8 @@ from protocol.mission import Box, Target
 
 CANDIDATES: Final = 96
 """Newest photographs that a fragment is chosen from."""
+TRIED: Final = 3
+"""Lessons from which the one with the most surface is taken: much of a room is bare floor, which is soon learnt."""
 JITTER_M: Final = 0.3
 """Standard deviation of the window's place, so that every part of a fragment is learnt from."""
 STEPS: Final = 127
@@ -71,6 +72,24 @@ class Lesson:
     """(X, Y, Z) of fine voxels, in [-1, 1]."""
     occupied: NDArray[np.bool_]
     """(X, Y, Z)"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scope:
+    """What a lesson would be of."""
+
+    room: Room
+    places: NDArray[np.int64]
+    """Of its photographs."""
+    first: tuple[int, int, int]
+    """Voxel of the room at the window's lower corner."""
+    part: tuple[slice, ...]
+    """The window."""
+
+    @property
+    def surface(self) -> int:
+        """Voxels near surfaces."""
+        return int(np.count_nonzero(self.room.occupied[self.part]))
 
 
 def load_room(path: Path) -> Room:
@@ -120,9 +139,14 @@ def _observe(volume: Volume, view: View, depth: NDArray[np.float16]) -> None:
 
 
 def draw_lesson(rooms: list[Room], settings: TrainingSettings, draw: int, *, varied: bool = True) -> Lesson:
-    """The lesson of a draw; ``varied``: with light, colours, poses and axes changed as well."""
+    """The lesson of a draw; ``varied``: with light, colours, poses and axes changed, and rather of furniture."""
     rng = np.random.default_rng([settings.seed, draw])
-    for _ in itertools.count():
+    tried = [_draw_scope(rooms, settings, rng, varied) for _ in range(TRIED if varied else 1)]
+    return _lesson(max(tried, key=lambda scope: scope.surface), settings, rng, varied)
+
+
+def _draw_scope(rooms: list[Room], settings: TrainingSettings, rng: np.random.Generator, varied: bool) -> _Scope:
+    while True:
         room = rooms[int(rng.integers(len(rooms)))]
         newest = int(rng.integers(len(room.views)))
         places = np.arange(newest, max(newest - CANDIDATES, -1), -1)
@@ -131,22 +155,22 @@ def draw_lesson(rooms: list[Room], settings: TrainingSettings, draw: int, *, var
             places[1:] = rng.permutation(places[1:])
         chosen = choose_views([room.views[place] for place in places], room.box)
         if len(chosen) >= VIEWS_MIN:
-            return _lesson(room, places[chosen], settings, rng, varied)
-    raise AssertionError
-
-
-def _lesson(
-    room: Room, places: NDArray[np.int64], settings: TrainingSettings, rng: np.random.Generator, varied: bool
-) -> Lesson:
-    views = [room.views[place] for place in places]
-    centre = middle_of(views, room.box) + (rng.normal(0, JITTER_M, 3) if varied else 0)
+            break
+    centre = middle_of([room.views[place] for place in places[chosen]], room.box)
+    centre += rng.normal(0, JITTER_M, 3) if varied else 0
     window = place_window(centre, room.origin, room.distance.shape, settings.window)
-    first, size = np.array(window.first), COARSE * np.array(settings.window)
-    part = tuple(slice(low, low + count) for low, count in zip(first, size, strict=True))
-    distance, occupied = _padded(room.distance[part], size, -STEPS), _padded(room.occupied[part], size, 0)
-    images = room.images[places].astype(np.float32) / np.float32(255)
+    size = COARSE * np.array(settings.window)
+    part = tuple(slice(low, low + count) for low, count in zip(window.first, size, strict=True))
+    return _Scope(room, places[chosen], window.first, part)
+
+
+def _lesson(scope: _Scope, settings: TrainingSettings, rng: np.random.Generator, varied: bool) -> Lesson:
+    room, size = scope.room, COARSE * np.array(settings.window)
+    views = [room.views[place] for place in scope.places]
+    distance, occupied = _padded(room.distance[scope.part], size, -STEPS), _padded(room.occupied[scope.part], size, 0)
+    images = room.images[scope.places].astype(np.float32) / np.float32(255)
     to_world = np.eye(4)
-    to_world[:3, 3] = room.origin + FINE_M * first
+    to_world[:3, 3] = room.origin + FINE_M * np.array(scope.first)
     if varied:
         views = [_shaken(view, settings, rng) for view in views]
         images = _relit(images, rng)
