@@ -34,8 +34,8 @@ def train(
 
     ```
     covrecon train --minutes 40                           # of learning, after some minutes of furnishing
-    covrecon train --steps 6000 --out training/long       # as long as it takes
-    covrecon train --steps 6000 --out training/long --resume
+    covrecon train --steps 10000 --out training/long       # as long as it takes
+    covrecon train --steps 10000 --out training/long --resume
     ```
 
     A mission flies with them by `reconstruction.backend = "learned"` and `reconstruction.learned.weights = FILE`.

@@ -207,7 +207,7 @@ def test_weights_that_do_not_fit_are_refused_with_the_file_s_name(tmp_path: Path
     with pytest.raises(ReconstructionError, match=r"own\.safetensors: no weights"):
         load_network(path)
     network = Network()
-    save_network(path, network, "a test")
+    save_network(path, network)
     assert load_network(path).state_dict().keys() == network.state_dict().keys()
     tensors = dict(network.state_dict())
     save_file(tensors, path, metadata={"architecture": "another/1"})

@@ -47,12 +47,13 @@ def load_network(path: Path = SHIPPED) -> Network:
     return network
 
 
-def save_network(path: Path, network: Network, origin: str) -> None:
-    """Write its weights in half precision; ``origin`` says where they are from."""
+def save_network(path: Path, network: Network) -> None:
+    """Write its weights in half precision; equal weights are equal files."""
     from safetensors.torch import save
 
     from ground_station.durable import replace_file
     from ground_station.reconstruction.learned.network import ARCHITECTURE
 
     halves = {name: tensor.half().contiguous() for name, tensor in network.state_dict().items()}
-    replace_file(path, [save(halves, metadata={"architecture": ARCHITECTURE, "origin": origin})])
+    content = save(halves, metadata={"architecture": ARCHITECTURE})  # two keys would come in any order
+    replace_file(path, [content])

@@ -73,7 +73,7 @@ def run_course(
                 console.print(f"the training takes {total} steps")
             if trainer.step % settings.measured_every == 0 or trainer.step == total:
                 _report(folder, trainer, console)
-    save_network(folder / WEIGHTS_FILE, trainer.network, f"covrecon train, {trainer.step} steps, seed {settings.seed}")
+    save_network(folder / WEIGHTS_FILE, trainer.network)
     console.print(f"weights: {folder / WEIGHTS_FILE}")
 
 

@@ -24,7 +24,7 @@ class TrainingSettings(Settings):
     """... and rooms that only the curve's held-out part is measured on."""
     first_room: Annotated[int, Field(ge=0)] = 100_000
     """Seed of the first room; those learnt from come first. Far from the seeds that people fly in."""
-    steps: Count = 6000
+    steps: Count = 10_000
     """Fragments that are learnt from, one a step; `covrecon train` may be given others."""
     learning_rate: Positive = 2e-3
     """Of AdamW."""
