@@ -28,8 +28,8 @@ DRIFT_M = 1e-4
 def rehearse(mission: Mission) -> int:
     """Map a flat, randomly patterned floor seen from a camera that moves sideways; how many images were fused.
 
-    Of ``mission`` it takes backend, refinement, weights and feedback alone: compiling does not depend on sizes. It takes
-    half a second, or the better part of a minute on a machine that has not compiled yet. For a map that is made
+    Of ``mission`` it takes backend, refinement, weights and feedback alone: compiling does not depend on sizes. It
+    takes half a second, or the better part of a minute on a machine that has not compiled yet. For a map that is made
     elsewhere, another one stands in, so that there is a mesh to compare.
     """
     asked = mission.reconstruction
