@@ -351,7 +351,7 @@ class Agent:
             sampling=decision.sampling,
             solve_s=solve_s,
             separation_margin_m2=rows.margin("separation", UNLIMITED),
-            region_margin_m=rows.margin("region", UNLIMITED),
+            region_margin_m=min(rows.margin("region", UNLIMITED), rows.margin("zone", UNLIMITED)),
             pitch_margin_rad2=rows.margin("pitch", UNLIMITED),
             active=decision.active,
             fallbacks=self._fallbacks,

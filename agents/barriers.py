@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from protocol.airspace import airspace_of
 from protocol.geometry import Floats
 from protocol.mission import Flight, Mission
 from protocol.separation import top_speed, widened_separation
@@ -43,9 +44,13 @@ class Rows:
     barriers: Floats
     """(rows,)."""
 
+    def of(self, kind: str) -> list[int]:
+        """Which rows are of one kind: what stands before a colon in their names."""
+        return [k for k, name in enumerate(self.names) if name.partition(":")[0] == kind]
+
     def margin(self, kind: str, without: float) -> float:
         """Smallest barrier among the rows of one kind; ``without`` if there is none."""
-        chosen = [k for k, name in enumerate(self.names) if name.startswith(kind)]
+        chosen = self.of(kind)
         return float(self.barriers[chosen].min()) if chosen else without
 
 
@@ -56,6 +61,8 @@ def predicted_pose(pose: Floats, velocity: Floats, flight: Flight) -> Floats:
 
 REGION = ("region:-x", "region:-y", "region:-z", "region:+x", "region:+y", "region:+z")
 PITCH = "pitch"
+SEPARATION, ZONE = "separation", "zone"
+"""Kinds of rows: ``separation:<id>``, ``zone:<name>``."""
 FIXED_ROWS = 1 + len(REGION)
 """Rows that a lone drone has."""
 
@@ -72,6 +79,9 @@ class Barriers:
         self._region = np.zeros((FIXED_ROWS, 5))
         self._region[1:4, :3], self._region[4:7, :3] = np.eye(3), -np.eye(3)
         self._wide, self._top_speed = widened_separation(flight), top_speed(flight)
+        self._airspace = airspace_of(flight)
+        # A zone that is farther away is no limit: not even at top speed does its barrier shrink as fast as it may.
+        self._reach_m = self._top_speed / self._gain
         self._speed = np.array(flight.velocity_limits)
         self._change = np.full(5, np.inf)
         if flight.response_time_s > 0:
@@ -85,6 +95,7 @@ class Barriers:
         separation:<id>: one per neighbour (departure 7), b = |dy|^2 - D^2. Each drone's own velocity may shrink b by
         gain b; two that approach each other shrink it by twice that, and it still never becomes negative. A neighbour
         that has been silent for ``age`` keeps its place, and D grows by ``age`` times its top speed.
+        zone:<name>: one per convex part of a zone that may be a limit, b = distance from it less D.
         """
         positions = np.array([neighbour.position for neighbour in neighbours]).reshape(-1, 3)
         distances = np.array([self._wide + neighbour.age_s * self._top_speed for neighbour in neighbours])
@@ -93,8 +104,21 @@ class Barriers:
         )
         bounds = -self._gain * barriers
         bounds[0] = -self._pitch_gain * barriers[0]
-        names = (PITCH, *REGION, *[f"separation:{neighbour.drone}" for neighbour in neighbours])
-        return Rows(names, coefficients, bounds, barriers)
+        names = (PITCH, *REGION, *[f"{SEPARATION}:{neighbour.drone}" for neighbour in neighbours])
+        rows = Rows(names, coefficients, bounds, barriers)
+        return rows if self._airspace.is_open else self._with_zones(rows, predicted)
+
+    def _with_zones(self, rows: Rows, predicted: Floats) -> Rows:
+        found = self._airspace.barriers(predicted[:3], self._reach_m)
+        coefficients = np.zeros((len(found), 5))
+        coefficients[:, :3] = [zone.gradient for zone in found]
+        barriers = np.array([zone.value_m for zone in found])
+        return Rows(
+            (*rows.names, *[f"{ZONE}:{zone.name}" for zone in found]),
+            np.concatenate([rows.coefficients, coefficients]),
+            np.concatenate([rows.bounds, -self._gain * barriers]),
+            np.concatenate([rows.barriers, barriers]),
+        )
 
     def velocity_bounds(self, velocity: Floats) -> tuple[Floats, Floats]:
         """Lower and upper bound of u, (5,) each: the input box U, and no more acceleration than the vehicle has.

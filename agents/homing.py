@@ -1,7 +1,8 @@
 """Home, and down: where a drone wants to go when it no longer covers. Wishes only: the strict rows decide.
 
-Two rules keep wishes from ending in a stalemate, which strict rows alone would hold for ever: who meets somebody on the
-way keeps to the right, and nobody comes down above another.
+Three rules keep wishes from ending in a stalemate, which strict rows alone would hold for ever: who meets somebody on
+the way keeps to the right, nobody comes down above another, and around zones one goes by their corners, as
+`agents.pathway` says.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from agents.barriers import Neighbour
+from agents.pathway import Pathway
 from agents.planners.planner import Decision, Planner
 from protocol.geometry import Floats
 from protocol.mission import Mission
@@ -40,6 +42,7 @@ class Homecoming:
 
     def __init__(self, mission: Mission, drone: int, planner: Planner) -> None:
         self._flight, self._home, self._planner = mission.flight, mission.drone(drone).start, planner
+        self._pathway = Pathway(mission.flight)
         self._left_m = math.inf
         """Way to go, the least so far ..."""
         self._nearer_s = 0.0
@@ -52,14 +55,19 @@ class Homecoming:
     ) -> Decision:
         """``pose`` and ``velocity`` (5,); ``home``: at the start's place instead of here."""
         distance, speed = self._flight.estimated_separation_m, self._flight.speed_max_mps
-        if home:
+        leg = self._pathway.leg(pose[:3], np.array(self._home[:2]) if home else None)
+        if leg is not None:
+            wish = leg_wish(pose, leg.end, neighbours, distance, speed)
+        elif home:
             wish = home_wish(pose, self._home, neighbours, distance, speed)
         else:
             wish = down_wish(pose, neighbours, distance, speed)
         decision = self._planner.steer(pose, velocity, neighbours, wish)
         height = float(pose[2]) - self._flight.lower_m[2]
-        self.landing = self.landing or bool(height < TOUCHDOWN_M and wish[2] < 0)
+        self.landing = self.landing or bool(leg is None and height < TOUCHDOWN_M and wish[2] < 0)
         left_m = height + (math.dist(pose[:2], self._home[:2]) if home else 0.0)
+        if leg is not None:
+            left_m = leg.left_m
         if left_m < self._left_m - NEARER_M:
             self._left_m, self._nearer_s = left_m, now_s
         elif now_s - self._nearer_s > STUCK_S and not self.landing and not _below(pose, neighbours, distance):
@@ -70,16 +78,35 @@ class Homecoming:
     def put_off(self) -> None:
         """It does something else now."""
         self._left_m = math.inf
+        self._pathway.forget()
 
 
 def home_wish(
     pose: Floats, home: Sequence[float], neighbours: Sequence[Neighbour], separation_m: float, speed_mps: float
 ) -> Floats:
     """Velocity (5,) towards ``home`` (x, y) at the present height; `down_wish` once it is reached."""
-    offset = np.asarray(home[:2], float) - pose[:2]
-    distance = float(np.linalg.norm(offset))
-    if distance < ARRIVED_M:
+    if math.dist(home[:2], pose[:2]) < ARRIVED_M:
         return down_wish(pose, neighbours, separation_m, speed_mps)
+    return _level_wish(pose, np.asarray(home[:2], float), neighbours, separation_m, speed_mps)
+
+
+def leg_wish(pose: Floats, end: Floats, neighbours: Sequence[Neighbour], separation_m: float, speed_mps: float) -> Floats:
+    """Velocity (5,) along a leg to ``end`` (3,): to its height and to its place at once, for the leg is level or
+    vertical, but for what the drone is off it."""
+    wish = np.zeros(5)
+    if math.dist(end[:2], pose[:2]) > 0:
+        wish = _level_wish(pose, end[:2], neighbours, separation_m, speed_mps)
+    climb = APPROACH_PER_S * float(end[2] - pose[2])
+    wish[2] = min(max(climb, -min(DESCENT_MPS, speed_mps)), speed_mps)
+    return wish
+
+
+def _level_wish(
+    pose: Floats, place: Floats, neighbours: Sequence[Neighbour], separation_m: float, speed_mps: float
+) -> Floats:
+    """Velocity (5,) towards ``place`` (2,), keeping to the right of others."""
+    offset = place - pose[:2]
+    distance = float(np.linalg.norm(offset))
     heading = offset / distance
     if _meets(pose, heading, neighbours, separation_m):
         heading = (heading + np.array([heading[1], -heading[0]])) / math.sqrt(2)  # 45 degrees to the right

@@ -13,7 +13,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from agents.vehicles.vehicle import Authority
+from protocol.airspace import airspace_of
 from protocol.mission import Flight, Mission
 
 Action = Literal["fly", "wait", "hold", "return", "land", "yield"]
@@ -283,9 +286,11 @@ class Policies:
 
 
 def outside_m(flight: Flight, position: Sequence[float]) -> float:
-    """Distance of ``position`` (x, y, z, world frame) from the flight region, metres; 0 inside."""
+    """Distance of ``position`` (x, y, z, world frame) from the flight region, metres; 0 inside. A zone, or the boundary,
+    begins where its clearance does."""
     bounds = zip(flight.lower_m, position, flight.upper_m, strict=True)
-    return math.hypot(*(max(low - value, 0.0, value - high) for low, value, high in bounds))
+    outside = math.hypot(*(max(low - value, 0.0, value - high) for low, value, high in bounds))
+    return max(outside, airspace_of(flight).inside_m(np.array(position, float)))
 
 
 def policy_table() -> list[tuple[str, str, str, str]]:

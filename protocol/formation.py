@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import TypeAlias
 
+from protocol.free_space import start_fault
 from protocol.mission import Flight
 
 Point: TypeAlias = tuple[float, float, float]
@@ -23,8 +24,8 @@ def formation(flight: Flight, count: int, taken: Sequence[Point] = ()) -> list[S
     """Up to ``count`` poses [x, y, z, yaw, pitch], fewer if no more fit; the same for the same arguments.
 
     They lie on a level square lattice of ``SPACING`` separations through the paper's start of drone 1 (moved into the
-    flight region where needed), nearest first, half a separation inside the region's sides, and ``SPACING``
-    separations from every point in ``taken`` (metres). Yaw is 0, pitch the middle of the gimbal's limits.
+    flight region where needed), nearest first, half a separation inside the region's sides, where its zones let a drone
+    start, and ``SPACING`` separations from every point in ``taken`` (metres). Yaw is 0, pitch the middle of the gimbal's limits.
     """
     pitch = sum(flight.pitch_limits_rad) / 2
     occupied = list(taken)
@@ -33,6 +34,8 @@ def formation(flight: Flight, count: int, taken: Sequence[Point] = ()) -> list[S
         if len(starts) == count:
             break
         if all(math.dist(point, other) >= SPACING * flight.separation_m * (1 - 1e-9) for other in occupied):
+            if start_fault(flight, point):
+                continue
             occupied.append(point)
             starts.append((*point, 0.0, pitch))
     return starts

@@ -86,6 +86,7 @@ class Control(Message):
     separation_margin_m2: Finite
     """Smallest barrier value among the separation rows; negative: too close."""
     region_margin_m: Finite
+    """Likewise among the rows of the flight region: its box, its boundary and its no-fly zones."""
     pitch_margin_rad2: Finite
     active: tuple[str, ...]
     """Rows that hold with equality."""

@@ -13,6 +13,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from protocol.free_space import start_faults, zone_faults
 from protocol.geometry import Intrinsics
 from protocol.operation_settings import Console, Metrics, Recording
 from protocol.planner_settings import PlannerName, Planners, planner_faults
@@ -20,6 +21,7 @@ from protocol.separation import widened_separation
 from protocol.settings import Angle, Metres, NonNegative, Positive, Settings, Share, Vector
 from protocol.transport_settings import Transport
 from protocol.vehicle_settings import Autopilot, Vehicles
+from protocol.zone_settings import ZONES_MAX, NoFly, Polygon
 
 
 class Box(Settings):
@@ -83,6 +85,13 @@ class Flight(Box):
 
     lower_m: Vector = (-4.0, -4.0, 0.5)
     upper_m: Vector = (4.0, 4.0, 5.0)
+    boundary: Polygon | None = None
+    """[[x, y], ...] within the box, which drones do not leave, at any height; left out: the box alone. docs/zones.md."""
+    no_fly: Annotated[tuple[NoFly, ...], Field(max_length=ZONES_MAX)] = ()
+    """What nobody enters."""
+    clearance_m: Positive = 0.3
+    """Distance of a drone's centre from boundary and zones: its radius, and what you want beside it; position_error_m
+    and what lag adds come on top. The box itself is kept by the centre."""
     separation_m: Positive = 1.0
     """d: distance that any two drones keep, centre to centre."""
     position_error_m: NonNegative = 0.0
@@ -121,6 +130,13 @@ class Flight(Box):
         low, high = self.pitch_limits_rad
         if not -math.pi / 2 <= low < high <= math.pi / 2:
             raise ValueError(f"pitch_limits_rad must ascend within [-pi/2, pi/2], got [{low}, {high}]")
+        return self
+
+    @model_validator(mode="after")
+    def _zones_leave_room(self) -> Self:
+        faults = zone_faults(self)
+        if faults:
+            raise ValueError("\n".join(faults))
         return self
 
     @model_validator(mode="after")
@@ -403,6 +419,7 @@ class Mission(Settings):
                         f"drones.{index}.start: {gap:.2f} m from drone {self.drones[other].id},"
                         f" less than flight.separation_m {self.flight.separation_m:g}"
                     )
+        faults += start_faults(self.flight, self.drones)
         gain = self.controller.separation_gain_per_s * self.tick_s
         if gain > 0.5:
             faults.append(

@@ -19,13 +19,19 @@ def top_speed(flight: Flight) -> float:
 
 def widened_separation(flight: Flight) -> float:
     """Separation D of predicted positions that keeps the drones' positions d apart, metres; d is
-    ``estimated_separation_m``.
+    ``estimated_separation_m``, and two drones close in at twice their top speed."""
+    return widened(flight.estimated_separation_m, 2 * top_speed(flight) * flight.response_time_s)
+
+
+def widened(distance_m: float, lag_m: float) -> float:
+    """Distance D of a predicted offset that keeps the offset itself ``distance_m`` away from the origin, metres.
+    ``lag_m``: its largest speed times the lag tau.
 
     While the predicted offset stays at least D away from the origin and moves at most at V, its direction turns at
     most at w = V / D, and its moving average over exp(-t / tau) keeps at least D / (1 + (w tau)^2) along the
     present direction. D is the positive root of D / (1 + (V tau / D)^2) = d, that is of D^3 - d D^2 - d (V tau)^2.
     """
-    distance, lag = flight.estimated_separation_m, 2 * top_speed(flight) * flight.response_time_s
+    distance, lag = distance_m, lag_m
     wide = distance + lag
     for _ in range(ROOT_STEPS):  # Newton's steps fall towards the root and never past it: the cubic is convex there
         wide -= (wide * wide * (wide - distance) - distance * lag * lag) / (wide * (3 * wide - 2 * distance))

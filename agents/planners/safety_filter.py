@@ -5,13 +5,14 @@ An outcome other than solved brakes. Planners differ in what they want, never in
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from agents.barriers import FIXED_ROWS, Barriers, Neighbour, Rows, predicted_pose
+from agents.barriers import FIXED_ROWS, SEPARATION, ZONE, Barriers, Neighbour, Rows, predicted_pose
 from agents.planners.planner import STAY, Decision
 from agents.quadratic_program import NOTHING_HELD, Held, QuadraticProgram
+from protocol.airspace import airspace_of
 from protocol.geometry import Floats
 from protocol.mission import Mission
 from protocol.separation import top_speed
@@ -19,13 +20,17 @@ from protocol.separation import top_speed
 WISH_WEIGHT = 1e3
 """How much more a wished velocity counts than effort: it is flown to a thousandth."""
 
+ZONE_ROWS = 6
+"""Room for parts of zones that are near at once; where there are more, a larger program is set up, in a millisecond."""
+
 
 class SafetyFilter:
     def __init__(self, mission: Mission, neighbours: int) -> None:
         """``neighbours``: as many as are expected."""
         self._mission = mission
         self._barriers = Barriers(mission)
-        self._program = QuadraticProgram(FIXED_ROWS + neighbours, mission.controller.effort_weight)
+        zones = 0 if airspace_of(mission.flight).is_open else ZONE_ROWS
+        self._program = QuadraticProgram(FIXED_ROWS + neighbours + zones, mission.controller.effort_weight)
 
     def solve(
         self,
@@ -44,7 +49,7 @@ class SafetyFilter:
         predicted = predicted_pose(pose, velocity, flight)
         rows = self._barriers.rows(predicted, neighbours)
         low, high = self._barriers.velocity_bounds(velocity)
-        if len(rows.names) > self._program.strict_rows:  # somebody who is not in the mission was heard of
+        if len(rows.names) > self._program.strict_rows:  # more zones are near, or somebody not in the mission was heard of
             self._program = QuadraticProgram(len(rows.names), settings.effort_weight)
         solution = self._program.solve(xi1, xi2, rows, low, high, held)
         if solution.outcome == "solved":
@@ -60,21 +65,40 @@ class SafetyFilter:
 
     def brake(self, rows: Rows, low: Floats, high: Floats) -> Floats:
         """Stop; or, where strict rows are broken already, undo that as fast as the vehicle can, unless another row
-        forbids it: away from the nearest neighbour first, else back into the region and the gimbal's range."""
-        separation = rows.barriers[FIXED_ROWS:]
-        if separation.size and separation.min() < 0:
-            offset = rows.coefficients[FIXED_ROWS + int(separation.argmin())]
-            distance = float(np.linalg.norm(offset))
-            if distance > 0:  # else every direction is as good as any
-                retreat: Floats = np.clip(offset / distance * top_speed(self._mission.flight), low, high)
-                if _worsens_nothing(rows, retreat):
-                    return retreat
+        forbids it: away from the nearest neighbour first, else out of the zones, else back into the box and the gimbal's
+        range."""
+        for offset in [*self._from_others(rows), *self._out_of_zones(rows)]:
+            retreat: Floats = np.clip(offset * top_speed(self._mission.flight), low, high)
+            if _worsens_nothing(rows, retreat):
+                return retreat
         inwards: Floats = np.zeros(5)
         for k in np.flatnonzero(rows.barriers[:FIXED_ROWS] < 0):
             axis = int(np.abs(rows.coefficients[k]).argmax())  # each of these rows is about one
             inwards[axis] = rows.bounds[k] / rows.coefficients[k, axis]
         inwards = np.clip(inwards, low, high)
         return inwards if _worsens_nothing(rows, inwards) else np.zeros(5)
+
+    def _from_others(self, rows: Rows) -> Iterator[Floats]:
+        """The direction (5,) away from the nearest neighbour, if it is too near."""
+        separation = rows.of(SEPARATION)
+        if separation and rows.barriers[separation].min() < 0:
+            yield from _directions(rows, [separation[int(rows.barriers[separation].argmin())]])
+
+    def _out_of_zones(self, rows: Rows) -> Iterator[Floats]:
+        """Directions (5,) out of those that it is in: of all together, then of the deepest one, and so on."""
+        broken = [k for k in rows.of(ZONE) if rows.barriers[k] < 0]
+        yield from _directions(rows, broken)
+        if len(broken) > 1:
+            for k in sorted(broken, key=lambda k: rows.barriers[k]):
+                yield from _directions(rows, [k])
+
+
+def _directions(rows: Rows, chosen: list[int]) -> Iterator[Floats]:
+    """The one in which the barriers of the ``chosen`` rows grow, of length 1; none if there is no such one."""
+    growing: Floats = rows.coefficients[chosen].sum(axis=0)
+    length = float(np.linalg.norm(growing))
+    if length > 0:  # else every direction is as good as any
+        yield growing / length
 
 
 def _worsens_nothing(rows: Rows, velocity: Floats) -> bool:

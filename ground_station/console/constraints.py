@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Final
 
+from protocol.airspace import in_words as in_words_of_zone
+
 BOUNDS: Final = {
     "x": "speed limit along x",
     "y": "speed limit along y",
@@ -26,6 +28,8 @@ def in_words(row: str) -> str:
             return f"distance to drone {what}"
         case "region":
             return f"edge of the region ({what})"
+        case "zone":
+            return in_words_of_zone(what)
         case "pitch":
             return "range of the gimbal"
         case "bound" if what in BOUNDS:

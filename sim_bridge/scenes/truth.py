@@ -16,9 +16,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from protocol.airspace import airspace_of
 from protocol.errors import SceneError
 from protocol.geometry import Floats
-from protocol.mission import Mission
+from protocol.mission import Flight, Mission
 from sim_bridge.scenes.cropping import crop_to_box
 from sim_bridge.scenes.ply import write_ply
 from sim_bridge.scenes.scene import Scene, replace_file, source_digest
@@ -125,9 +126,18 @@ def _key(scene: Scene, mission: Mission) -> str:
         source_digest("truth", "visibility", "cropping", "things"),
         (mission.target.lower_m, mission.target.upper_m),
         (flight.lower_m, flight.upper_m, flight.pitch_limits_rad),
+        _zones(mission.flight),
         (camera.horizontal_fov_rad, camera.height_px / camera.width_px),
     ]
     return hashlib.sha256(json.dumps(values).encode()).hexdigest()[:16]
+
+
+def _zones(flight: Flight) -> list[object]:
+    """What `airspace_of` is made of."""
+    if airspace_of(flight).is_open:
+        return []
+    zones = [zone.model_dump() for zone in flight.no_fly]
+    return [flight.boundary, zones, airspace_of(flight).distance_m, airspace_of(flight).wide_m]
 
 
 def _read(path: Path) -> Truth | None:

@@ -15,6 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
+from protocol.airspace import airspace_of
 from protocol.geometry import Floats, camera_rotation
 from protocol.mission import Box, Camera, Mission
 from sim_bridge.scenes.lighting import even_directions, ray_caster
@@ -41,6 +42,10 @@ class _Places:
     origin: Floats
     spacing: float
 
+    def at(self, chosen: NDArray[np.bool_]) -> Floats:
+        """Positions (n, 3) of those that are ``chosen`` [x, y, z]."""
+        return self.origin + self.spacing * np.argwhere(chosen)
+
 
 def exposed_points(scene: Scene, box: Box, points: NDArray[np.float32], faces: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Whether points [N, 3] in ``box``, on triangles ``faces`` [N], are seen from some place in the open there."""
@@ -62,6 +67,9 @@ def visible_points(
     upwards = even_directions(math.ceil(DIRECTIONS * (1 - low) / (high - low)), low)
     upwards = upwards[upwards[:, 2] <= high]
     places = _free_places(scene, np.array(flight.lower_m), np.array(flight.upper_m), CLEARANCE_GRID_M, CLEARANCE_M)
+    airspace = airspace_of(flight)
+    if not airspace.is_open:
+        places.free[places.free] = airspace.margins(places.at(places.free)) >= 0
     return _seen(scene, points, faces, upwards, STEEPEST_INCIDENCE_RAD, places)
 
 

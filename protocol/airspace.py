@@ -1,0 +1,190 @@
+"""Where drones may be within the flight box: inside the boundary, outside every no-fly zone, with room to spare.
+
+Everything is made of two kinds of obstacle. The convex hull of the boundary is a few half-spaces. What the boundary
+lacks of its hull, and every no-fly zone, is cut into convex polygons x heights, prisms. Both give strict rows
+grad b . u >= -a b on the predicted position y, which moves as commanded, dy/dt = u (`agents.barriers`):
+
+* half-space: b(y) = offset - n . y, which is linear. The moving average p of y stays in it because it is convex.
+* prism: b(y) = dist(y, prism) - D. The distance from a convex set is a convex function, so for a command u that is
+  held for a tick of length h, b(y + h u) >= b(y) + h grad b . u >= (1 - a h) b(y): the linear row promises less than
+  the barrier keeps, and b >= 0 stays true with nothing lost to curvature. D is the mission's distance d, widened
+  because p cuts corners: y stays D away from every single point of the prism, so p stays d away from each, as
+  `protocol.separation.widened` shows for one point that is approached at the drone's own top speed.
+
+Where all b >= 0, u = 0 meets every row, so zones alone never leave the quadratic program without an answer.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from protocol.geometry import Floats
+from protocol.polygons import Piece, convex_hull, convex_pieces, pockets
+from protocol.prisms import Counts, Flags, flat_distances, least_distances, prism_distances
+from protocol.separation import top_speed, widened
+from protocol.zone_settings import BOUNDARY
+
+if TYPE_CHECKING:
+    from protocol.mission import Flight
+
+_ROUNDING_M = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Barrier:
+    """One zone's barrier at a point."""
+
+    name: str
+    value_m: float
+    """b; negative: too near."""
+    gradient: Floats
+    """(3,), of length 1."""
+    kept_m: float
+    """Distance from the zone at which b is 0."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Airspace:
+    """Zones of one mission; the flight box itself is not among them."""
+
+    distance_m: float
+    """d: what a drone's estimated position keeps from boundary and zones."""
+    wide_m: float
+    """D: what its predicted position keeps from prisms."""
+    sides: Floats
+    """(m, 3) n_x, n_y, offset: n . y <= offset, n of length 1, the offset with d taken off."""
+    names: tuple[str, ...]
+    """Of the prisms; those of one zone have the same."""
+    firsts: Counts
+    corners: Floats
+    outer: Flags
+    heights: Floats
+    """These four as in `protocol.prisms`."""
+    floor_m: float
+    ceiling_m: float
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there is nothing but the box."""
+        return not self.names and not len(self.sides)
+
+    def barriers(self, point: Floats, reach_m: float) -> list[Barrier]:
+        """All at the predicted ``point`` (3,) that are below ``reach_m``, and the smallest one whatever it is."""
+        gradients = np.empty((len(self.names), 3))
+        prisms = prism_distances(point, self.firsts, self.corners, self.outer, self.heights, gradients) - self.wide_m
+        sides = self.sides[:, 2] - self.sides[:, :2] @ point[:2]
+        least = min(prisms.min(initial=math.inf), sides.min(initial=math.inf))
+        chosen = max(reach_m, least)
+        outwards = np.column_stack([-self.sides[:, :2], np.zeros(len(self.sides))])
+        return [
+            *(
+                Barrier(BOUNDARY, float(sides[k]), outwards[k], self.distance_m)
+                for k in np.flatnonzero(sides <= chosen)
+            ),
+            *(
+                Barrier(self.names[k], float(prisms[k]), gradients[k], self.wide_m)
+                for k in np.flatnonzero(prisms <= chosen)
+            ),
+        ]
+
+    def margins(self, points: Floats) -> Floats:
+        """(p,) smallest barrier at each of ``points`` (p, 3): not negative where a drone may hover; inf if open."""
+        least = least_distances(points, self.firsts, self.corners, self.outer, self.heights) - self.wide_m
+        sides = self.sides[:, 2] - points[:, :2] @ self.sides[:, :2].T
+        merged: Floats = np.minimum(least, sides.min(axis=1, initial=math.inf))
+        return merged
+
+    def inside_m(self, point: Floats) -> float:
+        """How far ``point`` (3,) is nearer to a zone, or to the boundary, than d; 0 where it is not."""
+        if self.is_open:
+            return 0.0
+        gaps = [barrier.value_m + barrier.kept_m - self.distance_m for barrier in self.barriers(point, 0.0)]
+        return max(0.0, -min(gaps, default=0.0))
+
+    def fault(self, point: Sequence[float]) -> str:
+        """Why no drone may be at ``point`` (x, y, z), or why it could not come down from there; empty if it may."""
+        place = np.array(point[:3], float)
+        for barrier in sorted(self.barriers(place, 0.0), key=lambda barrier: barrier.value_m):
+            if barrier.value_m < -_ROUNDING_M:
+                return _too_near(barrier)
+        flat = flat_distances(place[:2], self.firsts, self.corners, self.outer)
+        below = np.flatnonzero((flat < self.wide_m - _ROUNDING_M) & (self.heights[:, 0] < place[2]))
+        return f"lies above {in_words(self.names[below[0]])}: no drone could land there" if len(below) else ""
+
+    def levels(self, spare_m: float = 0.0) -> list[float]:
+        """Heights, ascending, from the floor to the ceiling of the box, between which the same prisms are in the way
+        of a drone that keeps D and ``spare_m``."""
+        keep = self.wide_m + spare_m
+        edges = [*(self.heights[:, 0] - keep).tolist(), *(self.heights[:, 1] + keep).tolist()]
+        between = {edge for edge in edges if self.floor_m < edge < self.ceiling_m}
+        return sorted({self.floor_m, self.ceiling_m, *between})
+
+    def active(self, height_m: float, spare_m: float = 0.0) -> Flags:
+        """(n,) prisms that are in the way at that height."""
+        keep = self.wide_m + spare_m
+        found: Flags = (self.heights[:, 0] - keep < height_m) & (height_m < self.heights[:, 1] + keep)
+        return found
+
+
+def in_words(zone: str) -> str:
+    return "the boundary" if zone == BOUNDARY else f"no-fly zone {zone!r}"
+
+
+def _too_near(barrier: Barrier) -> str:
+    gap = barrier.value_m + barrier.kept_m
+    side = "outside" if barrier.name == BOUNDARY else "inside"
+    where = f"{gap:.2f} m from" if gap >= 0 else side
+    return (
+        f"lies {where} {in_words(barrier.name)}; drones keep {barrier.kept_m:.2f} m from it,"
+        " flight.clearance_m and what lag and position_error_m add"
+    )
+
+
+@lru_cache(maxsize=64)
+def airspace_of(flight: Flight) -> Airspace:
+    """The zones of ``flight``, ready to be asked."""
+    distance = flight.clearance_m + flight.position_error_m
+    floor, ceiling = flight.lower_m[2], flight.upper_m[2]
+    pieces = list(_pieces(flight))
+    return Airspace(
+        distance_m=distance,
+        wide_m=widened(distance, top_speed(flight) * flight.response_time_s),
+        sides=np.array(list(_sides(flight, distance))).reshape(-1, 3),
+        names=tuple(name for name, _, _ in pieces),
+        firsts=np.cumsum([0, *(len(piece.corners) for _, piece, _ in pieces)]).astype(np.int64),
+        corners=np.array([corner for _, piece, _ in pieces for corner in piece.corners], float).reshape(-1, 2),
+        outer=np.array([outer for _, piece, _ in pieces for outer in piece.outer], np.bool_),
+        heights=np.array([heights for _, _, heights in pieces], float).reshape(-1, 2),
+        floor_m=floor,
+        ceiling_m=ceiling,
+    )
+
+
+def _sides(flight: Flight, distance_m: float) -> Iterator[tuple[float, float, float]]:
+    if flight.boundary is None:
+        return
+    hull = convex_hull(flight.boundary)
+    for (ax, ay), (bx, by) in pairwise([*hull, hull[0]]):
+        length = math.hypot(bx - ax, by - ay)
+        nx, ny = (by - ay) / length, (ax - bx) / length
+        yield nx, ny, nx * ax + ny * ay - distance_m
+
+
+def _pieces(flight: Flight) -> Iterator[tuple[str, Piece, tuple[float, float]]]:
+    """Name, polygon and heights of every prism. Heights to which nobody flies are no faces: whoever is inside by
+    mistake is not to be sent through the floor."""
+    for pocket in pockets(flight.boundary or ()) if flight.boundary else ():
+        for piece in convex_pieces(pocket, closed=False):
+            yield BOUNDARY, piece, (-math.inf, math.inf)
+    for zone in flight.no_fly:
+        low = -math.inf if zone.lower_m is None or zone.lower_m <= flight.lower_m[2] else zone.lower_m
+        high = math.inf if zone.upper_m is None or zone.upper_m >= flight.upper_m[2] else zone.upper_m
+        for piece in convex_pieces(zone.polygon):
+            yield zone.name, piece, (low, high)
