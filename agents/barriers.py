@@ -110,14 +110,11 @@ class Barriers:
 
     def _with_zones(self, rows: Rows, predicted: Floats) -> Rows:
         found = self._airspace.barriers(predicted[:3], self._reach_m)
-        coefficients = np.zeros((len(found), 5))
-        coefficients[:, :3] = [zone.gradient for zone in found]
-        barriers = np.array([zone.value_m for zone in found])
         return Rows(
-            (*rows.names, *[f"{ZONE}:{zone.name}" for zone in found]),
-            np.concatenate([rows.coefficients, coefficients]),
-            np.concatenate([rows.bounds, -self._gain * barriers]),
-            np.concatenate([rows.barriers, barriers]),
+            (*rows.names, *[f"{ZONE}:{name}" for name in found.names]),
+            np.concatenate([rows.coefficients, found.gradients]),
+            np.concatenate([rows.bounds, -self._gain * found.values_m]),
+            np.concatenate([rows.barriers, found.values_m]),
         )
 
     def velocity_bounds(self, velocity: Floats) -> tuple[Floats, Floats]:

@@ -90,7 +90,9 @@ def home_wish(
     return _level_wish(pose, np.asarray(home[:2], float), neighbours, separation_m, speed_mps)
 
 
-def leg_wish(pose: Floats, end: Floats, neighbours: Sequence[Neighbour], separation_m: float, speed_mps: float) -> Floats:
+def leg_wish(
+    pose: Floats, end: Floats, neighbours: Sequence[Neighbour], separation_m: float, speed_mps: float
+) -> Floats:
     """Velocity (5,) along a leg to ``end`` (3,): to its height and to its place at once, for the leg is level or
     vertical, but for what the drone is off it."""
     wish = np.zeros(5)

@@ -1,8 +1,8 @@
 """The way around zones that a drone follows home, or down: which leg of it is next, and when to look for another.
 
-A way is looked for when there is none yet, when the place to go is another one, and when the next leg is blocked: others
-may have pushed the drone aside. Where there is no way at all the wish stays straight, the strict rows hold the drone
-before the zone, and `agents.homing.STUCK_S` ends it.
+A way is looked for when there is none yet, when the place to go is another one, and when the next leg is blocked:
+others may have pushed the drone aside. Where there is no way at all the wish stays straight, the strict rows hold the
+drone before the zone, and `agents.homing.STUCK_S` ends it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Leg:
 class Pathway:
     def __init__(self, flight: Flight) -> None:
         self._routes, self._floor_m = routes_of(flight), flight.lower_m[2]
-        self._goal: Floats | None = None
+        self._goal: tuple[float, ...] | None = None
         self._way: list[Floats] = []
         self._wait = 0
 
@@ -50,10 +50,10 @@ class Pathway:
         if _is_straight(routes, place, goal):
             self.forget()
             return None
-        same = (goal is None) == (self._goal is None) and (goal is None or np.array_equal(goal, self._goal))
-        if not same:
+        wanted = None if goal is None else tuple(goal.tolist())
+        if wanted != self._goal:
             self.forget()
-        self._goal = goal
+        self._goal = wanted
         while len(self._way) > 1 and self._is_passed(routes, place):
             del self._way[0]
         if not self._way or not _may_fly(routes, place, self._way[0]):

@@ -286,8 +286,8 @@ class Policies:
 
 
 def outside_m(flight: Flight, position: Sequence[float]) -> float:
-    """Distance of ``position`` (x, y, z, world frame) from the flight region, metres; 0 inside. A zone, or the boundary,
-    begins where its clearance does."""
+    """Distance of ``position`` (x, y, z, world frame) from the flight region, metres; 0 inside. Zones and the
+    boundary begin where their clearance does."""
     bounds = zip(flight.lower_m, position, flight.upper_m, strict=True)
     outside = math.hypot(*(max(low - value, 0.0, value - high) for low, value, high in bounds))
     return max(outside, airspace_of(flight).inside_m(np.array(position, float)))

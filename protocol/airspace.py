@@ -27,7 +27,7 @@ import numpy as np
 
 from protocol.geometry import Floats
 from protocol.polygons import Piece, convex_hull, convex_pieces, pockets
-from protocol.prisms import Counts, Flags, flat_distances, least_distances, prism_distances
+from protocol.prisms import Counts, Flags, flat_distances, least_distances, near_zones
 from protocol.separation import top_speed, widened
 from protocol.zone_settings import BOUNDARY
 
@@ -37,17 +37,17 @@ if TYPE_CHECKING:
 _ROUNDING_M = 1e-9
 
 
-@dataclass(frozen=True, slots=True)
-class Barrier:
-    """One zone's barrier at a point."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Barriers:
+    """Barriers of some zones at one point."""
 
-    name: str
-    value_m: float
-    """b; negative: too near."""
-    gradient: Floats
-    """(3,), of length 1."""
-    kept_m: float
-    """Distance from the zone at which b is 0."""
+    names: tuple[str, ...]
+    values_m: Floats
+    """(k,) b; negative: too near."""
+    gradients: Floats
+    """(k, 5) by pose, of length 1."""
+    kept_m: Floats
+    """(k,) distance from the zone at which b is 0."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,24 +75,15 @@ class Airspace:
         """Whether there is nothing but the box."""
         return not self.names and not len(self.sides)
 
-    def barriers(self, point: Floats, reach_m: float) -> list[Barrier]:
-        """All at the predicted ``point`` (3,) that are below ``reach_m``, and the smallest one whatever it is."""
-        gradients = np.empty((len(self.names), 3))
-        prisms = prism_distances(point, self.firsts, self.corners, self.outer, self.heights, gradients) - self.wide_m
-        sides = self.sides[:, 2] - self.sides[:, :2] @ point[:2]
-        least = min(prisms.min(initial=math.inf), sides.min(initial=math.inf))
-        chosen = max(reach_m, least)
-        outwards = np.column_stack([-self.sides[:, :2], np.zeros(len(self.sides))])
-        return [
-            *(
-                Barrier(BOUNDARY, float(sides[k]), outwards[k], self.distance_m)
-                for k in np.flatnonzero(sides <= chosen)
-            ),
-            *(
-                Barrier(self.names[k], float(prisms[k]), gradients[k], self.wide_m)
-                for k in np.flatnonzero(prisms <= chosen)
-            ),
-        ]
+    def barriers(self, point: Floats, reach_m: float) -> Barriers:
+        """All at the predicted ``point`` (3,) that are below ``reach_m``, and the smallest one whatever it is. Not to
+        be asked of an open one."""
+        chosen, values, gradients = near_zones(
+            point, self.sides, self.firsts, self.corners, self.outer, self.heights, self.wide_m, reach_m
+        )
+        straight = len(self.sides)
+        names = tuple(BOUNDARY if k < straight else self.names[k - straight] for k in chosen.tolist())
+        return Barriers(names, values, gradients, np.where(chosen < straight, self.distance_m, self.wide_m))
 
     def margins(self, points: Floats) -> Floats:
         """(p,) smallest barrier at each of ``points`` (p, 3): not negative where a drone may hover; inf if open."""
@@ -105,15 +96,18 @@ class Airspace:
         """How far ``point`` (3,) is nearer to a zone, or to the boundary, than d; 0 where it is not."""
         if self.is_open:
             return 0.0
-        gaps = [barrier.value_m + barrier.kept_m - self.distance_m for barrier in self.barriers(point, 0.0)]
-        return max(0.0, -min(gaps, default=0.0))
+        found = self.barriers(point, 0.0)
+        return max(0.0, self.distance_m - float((found.values_m + found.kept_m).min()))
 
     def fault(self, point: Sequence[float]) -> str:
         """Why no drone may be at ``point`` (x, y, z), or why it could not come down from there; empty if it may."""
         place = np.array(point[:3], float)
-        for barrier in sorted(self.barriers(place, 0.0), key=lambda barrier: barrier.value_m):
-            if barrier.value_m < -_ROUNDING_M:
-                return _too_near(barrier)
+        if self.is_open:
+            return ""
+        found = self.barriers(place, 0.0)
+        worst = int(found.values_m.argmin())
+        if found.values_m[worst] < -_ROUNDING_M:
+            return _too_near(found.names[worst], float(found.values_m[worst]), float(found.kept_m[worst]))
         flat = flat_distances(place[:2], self.firsts, self.corners, self.outer)
         below = np.flatnonzero((flat < self.wide_m - _ROUNDING_M) & (self.heights[:, 0] < place[2]))
         return f"lies above {in_words(self.names[below[0]])}: no drone could land there" if len(below) else ""
@@ -137,12 +131,11 @@ def in_words(zone: str) -> str:
     return "the boundary" if zone == BOUNDARY else f"no-fly zone {zone!r}"
 
 
-def _too_near(barrier: Barrier) -> str:
-    gap = barrier.value_m + barrier.kept_m
-    side = "outside" if barrier.name == BOUNDARY else "inside"
-    where = f"{gap:.2f} m from" if gap >= 0 else side
+def _too_near(zone: str, barrier_m: float, kept_m: float) -> str:
+    gap = barrier_m + kept_m
+    where = f"{gap:.2f} m from" if gap >= 0 else "outside" if zone == BOUNDARY else "inside"
     return (
-        f"lies {where} {in_words(barrier.name)}; drones keep {barrier.kept_m:.2f} m from it,"
+        f"lies {where} {in_words(zone)}; drones keep {kept_m:.2f} m from it,"
         " flight.clearance_m and what lag and position_error_m add"
     )
 
@@ -188,3 +181,19 @@ def _pieces(flight: Flight) -> Iterator[tuple[str, Piece, tuple[float, float]]]:
         high = math.inf if zone.upper_m is None or zone.upper_m >= flight.upper_m[2] else zone.upper_m
         for piece in convex_pieces(zone.polygon):
             yield zone.name, piece, (low, high)
+
+
+def outlines(flight: Flight) -> Floats:
+    """Edges (n, 2, 3) of boundary and zones within the box's heights, for pictures."""
+    floor, ceiling = flight.lower_m[2], flight.upper_m[2]
+    shapes = [(flight.boundary, floor, ceiling)] if flight.boundary else []
+    for zone in flight.no_fly:
+        low = floor if zone.lower_m is None else max(zone.lower_m, floor)
+        high = ceiling if zone.upper_m is None else min(zone.upper_m, ceiling)
+        shapes.append((zone.polygon, low, high))
+    edges = []
+    for ring, low, high in shapes:
+        for one, other in pairwise([*ring, ring[0]]):
+            edges += [((*one, z), (*other, z)) for z in (low, high)]
+            edges.append(((*one, low), (*one, high)))
+    return np.array(edges, float).reshape(-1, 2, 3)

@@ -25,7 +25,8 @@ def formation(flight: Flight, count: int, taken: Sequence[Point] = ()) -> list[S
 
     They lie on a level square lattice of ``SPACING`` separations through the paper's start of drone 1 (moved into the
     flight region where needed), nearest first, half a separation inside the region's sides, where its zones let a drone
-    start, and ``SPACING`` separations from every point in ``taken`` (metres). Yaw is 0, pitch the middle of the gimbal's limits.
+    start, and ``SPACING`` separations from every point in ``taken`` (metres). Yaw is 0, pitch the middle of the gimbal's
+    limits.
     """
     pitch = sum(flight.pitch_limits_rad) / 2
     occupied = list(taken)

@@ -64,13 +64,14 @@ def free_space(flight: Flight) -> FreeSpace:
     ]
     grid = np.stack(np.meshgrid(*axes, heights, indexing="ij"), axis=-1)
     free = airspace.margins(grid.reshape(-1, 3)).reshape(grid.shape[:3]) >= -_ROUNDING_M
-    regions, count = label(free, structure=np.ones((3, 3, 3)))
+    regions = np.empty(free.shape, np.int32)
+    count = label(free, structure=np.ones((3, 3, 3)), output=regions)
     thickness = np.gradient(heights)
     cell = (axes[0][1] - axes[0][0]) * (axes[1][1] - axes[1][0])
     weights = np.broadcast_to(cell * thickness, free.shape)
     volumes = np.bincount(regions.ravel(), weights.ravel(), minlength=count + 1)
     volumes[0] = 0.0
-    return FreeSpace(regions.astype(np.int32), (axes[0], axes[1], heights), volumes)
+    return FreeSpace(regions, (axes[0], axes[1], heights), volumes)
 
 
 def zone_faults(flight: Flight) -> list[str]:

@@ -86,7 +86,7 @@ class Flight(Box):
     lower_m: Vector = (-4.0, -4.0, 0.5)
     upper_m: Vector = (4.0, 4.0, 5.0)
     boundary: Polygon | None = None
-    """[[x, y], ...] within the box, which drones do not leave, at any height; left out: the box alone. docs/zones.md."""
+    """[[x, y], ...] within the box, which drones do not leave at any height; left out: the box alone. docs/zones.md."""
     no_fly: Annotated[tuple[NoFly, ...], Field(max_length=ZONES_MAX)] = ()
     """What nobody enters."""
     clearance_m: Positive = 0.3

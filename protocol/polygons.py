@@ -40,16 +40,16 @@ def polygon_fault(corners: Sequence[Corner]) -> str:
             if math.dist(corners[k], corners[other]) < math.sqrt(AREA_LEAST_M2):
                 return f"has the corner {list(corners[k])} twice"
     for k in range(count):
+        before, here, after = corners[k - 1], corners[k], corners[(k + 1) % count]
+        if abs(_turn(before, here, after)) <= _STRAIGHT and _ahead(here, before, after) > 0:
+            return f"turns back on itself at {list(here)}"
+    for k in range(count):
         for other in range(k):
             if (k - other) % count in (1, count - 1):
                 continue
             if _touch(corners[other], corners[other + 1], corners[k], corners[(k + 1) % count]):
                 edges = [[list(corners[i]), list(corners[(i + 1) % count])] for i in (other, k)]
                 return f"crosses itself: its edges {edges[0]} and {edges[1]} meet"
-    for k in range(count):
-        before, here, after = corners[k - 1], corners[k], corners[(k + 1) % count]
-        if abs(_turn(before, here, after)) <= _STRAIGHT and _ahead(here, before, after) > 0:
-            return f"turns back on itself at {list(here)}"
     if abs(area(corners)) < AREA_LEAST_M2:
         return "encloses no area"
     return ""
@@ -120,7 +120,8 @@ def convex_pieces(corners: Sequence[Corner], *, closed: bool = True) -> list[Pie
 
 def _triangles(ring: Ring) -> list[Ring]:
     """Ears, counter-clockwise."""
-    left, found = list(ring), []
+    left: list[Corner] = list(ring)
+    found: list[Ring] = []
     while len(left) > 3:
         ears = [k for k in range(len(left)) if _is_ear(left, k)]
         if not ears:  # by rounding alone: every simple polygon has two (G. H. Meisters, 1975); more is safe, less not
@@ -205,6 +206,4 @@ def _touch(a: Corner, b: Corner, c: Corner, d: Corner) -> bool:
     if sides[0] * sides[1] < 0 and sides[2] * sides[3] < 0:
         return True
     on = ((sides[0], c, d, a), (sides[1], c, d, b), (sides[2], a, b, c), (sides[3], a, b, d))
-    return any(
-        abs(side) <= _STRAIGHT and _ahead(point, start, end) <= 0 for side, start, end, point in on
-    )
+    return any(abs(side) <= _STRAIGHT and _ahead(point, start, end) <= 0 for side, start, end, point in on)

@@ -69,23 +69,41 @@ def prism_distance(
 
 
 @njit(cache=True, nogil=True)
-def prism_distances(
-    point: Floats, firsts: Counts, corners: Floats, outer: Flags, heights: Floats, gradients: Floats
-) -> Floats:
-    """(n,) signed distances of ``point`` (3,); their ``gradients`` (n, 3) are written."""
-    distances = np.empty(firsts.size - 1)
-    for k in range(distances.size):
+def near_zones(
+    point: Floats,
+    sides: Floats,
+    firsts: Counts,
+    corners: Floats,
+    outer: Flags,
+    heights: Floats,
+    keep_m: float,
+    reach_m: float,
+) -> tuple[Counts, Floats, Floats]:
+    """Barriers at ``point`` (3,): of half-spaces, rows n_x, n_y, offset of ``sides`` (m, 3), what is left to the
+    offset; of prisms, the distance less ``keep_m``.
+
+    Of those below ``reach_m``, and of the smallest one whatever it is: numbers (k,), the half-spaces first; values
+    (k,); gradients (k, 5), by pose.
+    """
+    straight = sides.shape[0]
+    count = straight + firsts.size - 1
+    values, gradients = np.empty(count), np.zeros((count, 5))
+    for k in range(straight):
+        values[k] = sides[k, 2] - sides[k, 0] * point[0] - sides[k, 1] * point[1]
+        gradients[k, 0], gradients[k, 1] = -sides[k, 0], -sides[k, 1]
+    for k in range(count - straight):
         own = slice(firsts[k], firsts[k + 1])
-        distances[k], gradients[k, 0], gradients[k, 1], gradients[k, 2] = prism_distance(
+        distance, x, y, z = prism_distance(
             point[0], point[1], point[2], corners[own], outer[own], heights[k, 0], heights[k, 1]
         )
-    return distances
+        values[straight + k] = distance - keep_m
+        gradients[straight + k, 0], gradients[straight + k, 1], gradients[straight + k, 2] = x, y, z
+    chosen = np.flatnonzero(values <= max(reach_m, values.min()))
+    return chosen, values[chosen], gradients[chosen]
 
 
 @njit(cache=True, nogil=True)
-def least_distances(
-    points: Floats, firsts: Counts, corners: Floats, outer: Flags, heights: Floats
-) -> Floats:
+def least_distances(points: Floats, firsts: Counts, corners: Floats, outer: Flags, heights: Floats) -> Floats:
     """(p,) signed distance of each of ``points`` (p, 3) from the nearest prism; inf without any."""
     least = np.full(points.shape[0], math.inf)
     for k in range(firsts.size - 1):

@@ -1,7 +1,7 @@
 """Ways around zones: home, or to the nearest place where a drone can come down.
 
-A visibility graph. Its nodes are the corners of every prism, rounded off at the distance that is kept, at every level of
-height: a level is a range of heights through which the same prisms are in the way. Level legs lead where nothing is
+A visibility graph. Its nodes are the corners of every prism, rounded off at the distance that is kept, at every level
+of height: a level is a range of heights through which the same prisms are in the way. Level legs lead where nothing is
 in the way, vertical ones from level to level. A shortest way goes by such corners, so where there is a way of this
 kind it is found. Everything but the start and the goal of a question is looked at once, before take-off.
 """
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from protocol.mission import Flight
 
 SPARE_M = 0.02
-"""Legs keep so much more than D: a strict row lets a drone come nearer only exponentially, so on the line itself it would
-crawl."""
+"""Legs keep so much more than D: a strict row lets a drone come nearer only exponentially, so on the line itself it
+would crawl."""
 CORNER_STEP_RAD = math.pi / 4
 """A rounded corner is a few straight legs, each turning by at most so much."""
 _ROUNDING_M = 1e-9
@@ -66,7 +66,7 @@ class Routes:
         count = len(self._corners)
         for number, (low, high) in enumerate(pairwise(airspace.levels(SPARE_M / 2))):
             active = airspace.active((low + high) / 2, SPARE_M / 2)
-            free = ~((flat < self._needed) & active).any(axis=1)
+            free: Flags = np.logical_not(((flat < self._needed) & active).any(axis=1))
             self.levels.append(Level(low, high, active, free))
             pairs = clear_pairs(self._corners, free, self._needed, active, airspace.firsts, airspace.corners)
             one, other = np.nonzero(pairs)
@@ -94,7 +94,10 @@ class Routes:
                 if not self._may_be(flat, level):
                     continue
                 needed = np.minimum(self._needed, flat)
-                seen = [*node[level.free], *([first] if k > first and self._may_be(self._flat(start[:2]), level) else [])]
+                seen = [
+                    *node[level.free],
+                    *([first] if k > first and self._may_be(self._flat(start[:2]), level) else []),
+                ]
                 for other in seen:
                     least = needed if other < first else np.minimum(needed, self._flat(points[other]))
                     if self._sees(points[other], end, least, level):
@@ -121,9 +124,7 @@ class Routes:
         flat = self._flat(place[:2])
         return level is not None and all(self._may_be(flat, below) for below in self.levels[: level + 1])
 
-    def _shortest(
-        self, start: Floats, points: Floats, edges: Floats, goal: int | None
-    ) -> list[Floats] | None:
+    def _shortest(self, start: Floats, points: Floats, edges: Floats, goal: int | None) -> list[Floats] | None:
         level, count = self._level_at(start), len(points)
         if level is None:
             return None
@@ -131,7 +132,8 @@ class Routes:
         ends = edges[:, :2].astype(np.int64)
         graph = coo_array((edges[:, 2], (ends[:, 0], ends[:, 1])), shape=(size, size)).tocsr()
         source = level * count + len(self._corners)
-        lengths, before = dijkstra(graph, directed=False, indices=source, return_predecessors=True)
+        lengths, before = dijkstra(graph, directed=False, indices=[source], return_predecessors=True)
+        lengths, before = lengths[0], before[0]
         target = int(np.argmin(lengths[:count])) if goal is None else goal
         if not np.isfinite(lengths[target]):
             return None

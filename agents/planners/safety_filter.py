@@ -49,7 +49,9 @@ class SafetyFilter:
         predicted = predicted_pose(pose, velocity, flight)
         rows = self._barriers.rows(predicted, neighbours)
         low, high = self._barriers.velocity_bounds(velocity)
-        if len(rows.names) > self._program.strict_rows:  # more zones are near, or somebody not in the mission was heard of
+        if (
+            len(rows.names) > self._program.strict_rows
+        ):  # more zones are near, or somebody not in the mission was heard of
             self._program = QuadraticProgram(len(rows.names), settings.effort_weight)
         solution = self._program.solve(xi1, xi2, rows, low, high, held)
         if solution.outcome == "solved":
@@ -65,8 +67,8 @@ class SafetyFilter:
 
     def brake(self, rows: Rows, low: Floats, high: Floats) -> Floats:
         """Stop; or, where strict rows are broken already, undo that as fast as the vehicle can, unless another row
-        forbids it: away from the nearest neighbour first, else out of the zones, else back into the box and the gimbal's
-        range."""
+        forbids it: away from the nearest neighbour first, else out of the zones, else back into the box and the
+        gimbal's range."""
         for offset in [*self._from_others(rows), *self._out_of_zones(rows)]:
             retreat: Floats = np.clip(offset * top_speed(self._mission.flight), low, high)
             if _worsens_nothing(rows, retreat):

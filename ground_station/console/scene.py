@@ -18,6 +18,7 @@ from ground_station.console.field_view import Colours, FieldView, PointCloud, dr
 from ground_station.console.mesh_cache import Key, MeshCache, Redraw
 from ground_station.console.orders_panel import Post
 from ground_station.console.situation import Situation
+from protocol.airspace import outlines
 from protocol.field import VirtualField
 from protocol.geometry import Floats
 from protocol.messages import MeshBlock
@@ -29,9 +30,10 @@ UPRIGHT = "/map/upright"
 """Parent of all that is glTF: turned once, because a block that is drawn anew shows for a moment unturned."""
 GREY = (168, 172, 178)
 TARGET_COLOUR, FLIGHT_COLOUR, GRID_COLOUR = (255, 212, 59), (90, 96, 104), (60, 64, 70)
+ZONE_COLOUR = (240, 101, 92)
 BODY_M, FRUSTUM_M = 0.08, 0.3
 """Radius of the ball that stands for a drone, and size of its camera's pyramid."""
-LINE_PX, BOX_PX = 2.0, 1.0
+LINE_PX, BOX_PX, ZONE_PX = 2.0, 1.0, 1.5
 AMBIENT = 1.5
 """Light from everywhere: the map's colours have their light and shade from the pictures."""
 POINT_SHARE = 0.12
@@ -245,6 +247,9 @@ def _set_stage(server: viser.ViserServer, mission: Mission) -> None:
     )
     for name, box, colour in (("/target", target, TARGET_COLOUR), ("/flight", flight, FLIGHT_COLOUR)):
         scene.add_line_segments(name, _edges(box), colour, thickness=BOX_PX, thickness_units="screen")
+    zones = outlines(flight).astype(np.float32)
+    if len(zones):
+        scene.add_line_segments("/zones", zones, ZONE_COLOUR, thickness=ZONE_PX, thickness_units="screen")
     diagonal = float(np.linalg.norm(size))
     server.initial_camera.look_at = centre
     server.initial_camera.position = centre + VIEW_DISTANCE * diagonal * np.array([-0.55, -0.55, 0.6])

@@ -30,6 +30,8 @@ NO_ROW = 1e6
 """A margin beyond it comes from no row at all: a single drone has nobody to keep away from."""
 NEAR = 4.0
 """Separation barriers are drawn up to so many d², where two drones are more than twice d apart."""
+ZONE_SHADE = 0.35
+"""Opacity of a zone from floor to ceiling."""
 MODE_COLOURS = {
     "flying": "#cfe3f1",
     "braking": "#c62828",
@@ -137,7 +139,8 @@ def _name(flight: Flight, index: int, wanted: bool = True) -> str:
 
 
 def paths(flight: Flight, mission: Mission) -> str:
-    """Paths from above over the target B (filled) and the flight region P (dashed); a dot starts, an arrow ends."""
+    """Paths from above over the target B (filled) and the flight region P (dashed), with its boundary and no-fly zones
+    (red; one that leaves a way above or below is paler). A dot starts, an arrow ends."""
 
     def draw(axes: Axes) -> None:
         from matplotlib.patches import Rectangle
@@ -148,6 +151,7 @@ def paths(flight: Flight, mission: Mission) -> str:
         ):
             (x0, y0, _), (x1, y1, _) = box.lower_m, box.upper_m
             axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, linewidth=0.8, **style))
+        _draw_zones(axes, mission)
         for index, drone in enumerate(flight.drones):
             path = flight.poses[:, index]
             path = path[np.isfinite(path[:, 0])]
@@ -163,6 +167,23 @@ def paths(flight: Flight, mission: Mission) -> str:
         axes.grid(visible=False)
 
     return svg(draw, PLAN_INCHES)
+
+
+def _draw_zones(axes: Axes, mission: Mission) -> None:
+    from matplotlib.patches import Polygon
+
+    region = mission.flight
+    if region.boundary is not None:
+        axes.add_patch(Polygon(region.boundary, fill=False, edgecolor=LIMIT, linewidth=1, label="boundary"))
+    label = "no-fly zone"
+    for zone in region.no_fly:
+        through = (zone.lower_m is None or zone.lower_m <= region.lower_m[2]) and (
+            zone.upper_m is None or zone.upper_m >= region.upper_m[2]
+        )
+        shade = ZONE_SHADE if through else ZONE_SHADE / 2
+        axes.add_patch(Polygon(zone.polygon, facecolor=LIMIT, alpha=shade, linewidth=0, label=label))
+        axes.add_patch(Polygon(zone.polygon, fill=False, edgecolor=LIMIT, linewidth=0.8))
+        label = "_"
 
 
 def solve_times(flight: Flight, tick_s: float) -> str:

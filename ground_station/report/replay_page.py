@@ -21,6 +21,7 @@ from ground_station.mesh_files import glb
 from ground_station.palette import drone_colour
 from ground_station.report.replay_scene import Frame, Scene
 from ground_station.report.run_data import FieldMoment, MapMoment
+from protocol.airspace import outlines
 from protocol.geometry import Floats, camera_rotation
 from protocol.mission import Mission
 
@@ -40,7 +41,7 @@ FINER = 4096
 """Likewise for quaternions."""
 Y_UP = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)
 """Rotation (w, x, y, z) from glTF's axes to the world's."""
-REGION_COLOUR, TARGET_COLOUR = (154, 165, 177), (82, 96, 109)
+REGION_COLOUR, TARGET_COLOUR, ZONE_COLOUR = (154, 165, 177), (82, 96, 109), (198, 40, 40)
 VIEW = np.array([-0.75, -1.0, 0.8])
 """Where the page first looks from: this direction from the middle of the target B, times its diagonal."""
 LINGER_S = 2.0
@@ -89,6 +90,9 @@ class _Stage:
         self._scene.world_axes.visible = False
         self._box("/flight region", mission.flight.lower_m, mission.flight.upper_m, REGION_COLOUR)
         self._box("/target", mission.target.lower_m, mission.target.upper_m, TARGET_COLOUR)
+        zones = outlines(mission.flight)
+        if len(zones):
+            self._line("/zones", zones, ZONE_COLOUR, BOX_PX)
         self._caption = self._scene.add_label(
             "/caption", "", position=(middle[0], middle[1], upper[2] + 0.2 * diagonal), anchor="center-center"
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any
 
@@ -45,8 +46,7 @@ def outline_m(polygon: tuple[tuple[float, float], ...], point: Floats) -> float:
     corners = np.array([*polygon, polygon[0]])
     shares = np.linspace(0, 1, 400)[:, None]
     return min(
-        float(np.linalg.norm(a + shares * (b - a) - point[:2], axis=1).min())
-        for a, b in zip(corners[:-1], corners[1:], strict=True)
+        float(np.linalg.norm(a + shares * (b - a) - point[:2], axis=1).min()) for a, b in itertools.pairwise(corners)
     )
 
 
