@@ -24,9 +24,9 @@ def formation(flight: Flight, count: int, taken: Sequence[Point] = ()) -> list[S
     """Up to ``count`` poses [x, y, z, yaw, pitch], fewer if no more fit; the same for the same arguments.
 
     They lie on a level square lattice of ``SPACING`` separations through the paper's start of drone 1 (moved into the
-    flight region where needed), nearest first, half a separation inside the region's sides, where its zones let a drone
-    start, and ``SPACING`` separations from every point in ``taken`` (metres). Yaw is 0, pitch the middle of the gimbal's
-    limits.
+    flight region where needed), nearest first, half a separation inside the region's sides, where its zones let a
+    drone start, and ``SPACING`` separations from every point in ``taken`` (metres). Yaw is 0, pitch the middle of the
+    gimbal's limits.
     """
     pitch = sum(flight.pitch_limits_rad) / 2
     occupied = list(taken)

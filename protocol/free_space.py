@@ -69,7 +69,7 @@ def free_space(flight: Flight) -> FreeSpace:
     thickness = np.gradient(heights)
     cell = (axes[0][1] - axes[0][0]) * (axes[1][1] - axes[1][0])
     weights = np.broadcast_to(cell * thickness, free.shape)
-    volumes = np.bincount(regions.ravel(), weights.ravel(), minlength=count + 1)
+    volumes = np.asarray(np.bincount(regions.ravel(), weights.ravel(), minlength=count + 1), np.float64)
     volumes[0] = 0.0
     return FreeSpace(regions, (axes[0], axes[1], heights), volumes)
 

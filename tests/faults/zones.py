@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from typing import Any
 
 import numpy as np
 
-from protocol.airspace import Airspace, airspace_of
 from protocol.free_space import start_fault
 from protocol.geometry import Floats
 from protocol.mission import Flight
@@ -29,7 +27,7 @@ def l_shaped(**settings: Any) -> Flight:
 
 def distance_m(flight: Flight, point: Floats) -> float:
     """How far ``point`` (3,) is from all zones and within the boundary, written down without the code that is tested:
-    by points along the edges of what is forbidden, every centimetre."""
+    no hull, no pieces, and inside by crossings."""
     nearest = math.inf
     for zone in flight.no_fly:
         low = flight.lower_m[2] if zone.lower_m is None else max(zone.lower_m, flight.lower_m[2])
@@ -43,11 +41,12 @@ def distance_m(flight: Flight, point: Floats) -> float:
 
 
 def outline_m(polygon: tuple[tuple[float, float], ...], point: Floats) -> float:
-    corners = np.array([*polygon, polygon[0]])
-    shares = np.linspace(0, 1, 400)[:, None]
-    return min(
-        float(np.linalg.norm(a + shares * (b - a) - point[:2], axis=1).min()) for a, b in itertools.pairwise(corners)
-    )
+    """Distance of the point from the nearest edge."""
+    corners = np.array(polygon)
+    along = np.roll(corners, -1, axis=0) - corners
+    offset = point[:2] - corners
+    shares = np.clip((offset * along).sum(axis=1) / (along**2).sum(axis=1), 0.0, 1.0)
+    return float(np.linalg.norm(offset - shares[:, None] * along, axis=1).min())
 
 
 def is_inside(polygon: tuple[tuple[float, float], ...], point: Floats) -> bool:
@@ -97,7 +96,3 @@ def starts(flight: Flight, rng: np.random.Generator, count: int) -> list[tuple[f
         if len(chosen) == count:
             break
     return chosen
-
-
-def airspace(flight: Flight) -> Airspace:
-    return airspace_of(flight)

@@ -118,7 +118,7 @@ WALL = {"name": "wall", "polygon": ((-0.2, -4.0), (0.2, -4.0), (0.2, 4.0), (-0.2
     ],
 )
 def test_zones_that_make_no_sense_are_refused(settings: dict[str, Any], fault: str) -> None:
-    with pytest.raises(ValidationError, match="(?s).*") as refused:
+    with pytest.raises(ValidationError) as refused:
         Flight(**settings)
     assert fault in str(refused.value)
 

@@ -1,0 +1,118 @@
+"""Whole flights among zones: nobody ever enters one, the map's importance falls, and everybody gets home."""
+
+from __future__ import annotations
+
+import math
+from typing import get_args
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from agents.barriers import Neighbour, predicted_pose
+from agents.homing import Homecoming
+from faults.team_flight import TeamFlight
+from faults.zones import distance_m, l_shaped, random_flight, starts
+from protocol.formation import formation
+from protocol.mission import Drone, Flight, Mission
+from protocol.planner_settings import PlannerName
+
+CHECK_EVERY = 5
+"""Ticks; a drone moves 0.2 m at most meanwhile."""
+
+
+def team(flight: Flight, places: list[tuple[float, float, float, float, float]], **tables: object) -> Mission:
+    drones = tuple(Drone(id=k, start=start) for k, start in enumerate(places, start=1))
+    return Mission.model_validate({"flight": flight, "drones": drones, **tables})
+
+
+def nearest_m(flight: TeamFlight) -> float:
+    return min(distance_m(flight.mission.flight, body.pose[:3]) for body in flight.bodies)
+
+
+def test_three_drones_map_an_l_with_two_zones_and_come_home() -> None:
+    region = l_shaped()
+    flight = TeamFlight(team(region, formation(region, 3)))
+    nearest = math.inf
+    while flight.importance >= 0.7:
+        flight.step()
+        assert flight.tick < 3000, f"J is still {flight.importance:.3f}"
+        if flight.tick % CHECK_EVERY == 0:
+            nearest = min(nearest, nearest_m(flight))
+
+    nearest = min(nearest, _bring_home(flight))
+
+    assert nearest >= region.clearance_m
+    assert nearest < region.clearance_m + 0.2, "and they fly up to the zones"
+    assert flight.min_separation >= region.separation_m
+    assert flight.outcomes.count("solved") > 0.99 * len(flight.outcomes)
+    for body, drone in zip(flight.bodies, flight.mission.drones, strict=True):
+        assert math.dist(body.pose[:2], drone.start[:2]) < 0.3
+        assert body.pose[2] < region.lower_m[2] + 0.1
+
+
+def _bring_home(flight: TeamFlight) -> float:
+    """Everybody returns and lands; the smallest distance from a zone on the way."""
+    mission, dt = flight.mission, flight.mission.tick_s
+    homecomings = [
+        Homecoming(mission, drone.id, planner) for drone, planner in zip(mission.drones, flight.planners, strict=True)
+    ]
+    nearest = math.inf
+    for tick in range(1600):
+        predicted = [predicted_pose(body.pose, body.velocity, mission.flight) for body in flight.bodies]
+        for row, (homecoming, body) in enumerate(zip(homecomings, flight.bodies, strict=True)):
+            others = [Neighbour(k + 1, place[:3], 0.0) for k, place in enumerate(predicted) if k != row]
+            decision = homecoming.steer(body.pose, body.velocity, others, home=True, now_s=tick * dt)
+            velocity = np.zeros(5) if homecoming.landing else decision.velocity
+            body.command(velocity, tick * dt, mission.flight)
+        for body in flight.bodies:
+            body.step(dt, tick * dt, mission.flight)
+        flight._note_separation(np.array([body.pose for body in flight.bodies]))
+        if tick % CHECK_EVERY == 0:
+            nearest = min(nearest, nearest_m(flight))
+        if all(homecoming.landing for homecoming in homecomings):
+            return nearest
+    raise AssertionError("still in the air")
+
+
+@pytest.mark.parametrize("planner", get_args(PlannerName))
+def test_every_planner_keeps_out_of_zones(planner: PlannerName) -> None:
+    region = l_shaped()
+    flight = TeamFlight(team(region, formation(region, 2), controller={"planner": planner}))
+    nearest = math.inf
+    for _ in range(300):
+        flight.step()
+        if flight.tick % CHECK_EVERY == 0:
+            nearest = min(nearest, nearest_m(flight))
+    assert nearest >= region.clearance_m
+    assert flight.min_separation >= region.separation_m
+    assert flight.path_m > 3.0, "and does not stand still because of them"
+    assert flight.importance < 0.97
+    assert flight.outcomes.count("solved") > 0.99 * len(flight.outcomes)
+
+
+@st.composite
+def missions(draw: st.DrawFn) -> Mission:
+    """Random zones, boundaries, lags, speeds, clearances and planners, with up to three drones."""
+    response, speed = draw(st.sampled_from([0.0, 0.1, 0.15, 0.25])), draw(st.sampled_from([0.3, 0.5, 0.8]))
+    region, rng = random_flight(
+        draw(st.integers(0, 10_000)),
+        response_time_s=response,
+        speed_max_mps=speed,
+        acceleration_max_mps2=max(4.0, speed / response if response else 4.0),
+        clearance_m=draw(st.sampled_from([0.1, 0.3])),
+    )
+    planner = draw(st.sampled_from(get_args(PlannerName)))
+    return team(region, starts(region, rng, 3), controller={"planner": planner})
+
+
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
+@given(mission=missions())
+def test_drones_never_enter_a_zone_whatever_it_is_like(mission: Mission) -> None:
+    flight = TeamFlight(mission)
+    for _ in range(120):
+        flight.step()
+        if flight.tick % CHECK_EVERY == 0:
+            assert nearest_m(flight) >= mission.flight.clearance_m
+    assert len(mission.drones) == 1 or flight.min_separation >= mission.flight.separation_m
