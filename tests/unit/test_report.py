@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 
 from faults.told import told
+from faults.zones import l_shaped
 from ground_station.evaluation import Score, Scores
 from ground_station.report import page, write_report
 from ground_station.report.picture import oblique_view, view_from_above
@@ -162,6 +163,14 @@ def test_a_complete_run_is_told_in_full(tmp_path: Path) -> None:
         "2.5 s", "0.1 s", "drone 3", "braked for 2 ticks: infeasible 2"
     ]  # fmt: skip
     assert {"[sensing]", "sigma_axis", "0.07", "9f" * 32} <= set(shown.words)
+
+
+def test_paths_are_drawn_with_the_zones_that_were_flown_around(tmp_path: Path) -> None:
+    mission = team(2, flight=l_shaped().model_dump())
+    text = write_report(flown(tmp_path, mission)).read_text()
+    assert "no-fly zone" in text
+    assert ">boundary<" in text
+    assert "no-fly zone" not in write_report(flown(tmp_path / "open", team(2))).read_text()
 
 
 def test_the_page_asks_the_network_for_nothing(tmp_path: Path) -> None:

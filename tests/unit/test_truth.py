@@ -216,3 +216,20 @@ def test_the_truth_of_a_scene_that_was_not_flown_is_written_by_a_process_of_its_
 
     assert main(["living_rom", str(tmp_path / "any.toml"), str(out)]) == 2
     assert "living_rom: no such scene" in capsys.readouterr().err
+
+
+def test_what_only_a_no_fly_zone_sees_does_not_count(plain: Truth, tmp_path: Path) -> None:
+    west = {"name": "west", "polygon": ((-4.0, -4.0), (0.9, -4.0), (0.9, 4.0), (-4.0, 4.0))}
+    flight = Flight(no_fly=(west,))  # type: ignore[arg-type]
+    drone = Drone(id=1, start=(2.5, 0.0, 3.0, 0.0, math.pi / 2))
+    truth = write_truth(stage(), mission(flight=flight, drones=(drone,)), tmp_path, cache=tmp_path / "cache")
+
+    def seen(told: Truth, x: float) -> float:
+        """Of the cube's face at ``x``, without its edges."""
+        face = on_cube(told) & (np.abs(told.points[:, 0] - x) < 1e-6) & (np.abs(told.points[:, 2] - 0.55) < 0.4)
+        return float(told.visible[face].mean())
+
+    assert seen(plain, -0.1) > 0.9
+    assert seen(truth, -0.1) == 0.0
+    assert seen(truth, 0.9) > 0.9
+    assert truth.exposed.sum() == plain.exposed.sum(), "which is no matter of where one flies"
