@@ -92,7 +92,7 @@ def _parts(mission: Mission, checkpoint: Checkpoint) -> Iterator[bytes | memoryv
         "tick": checkpoint.tick,
         "next_sequence": checkpoint.next_sequence,
         "totals": dict(checkpoint.totals),
-        "map": {"first": state.first, "end": state.end, "unreadable": state.unreadable},
+        "map": {"first": state.first, "end": state.end, "unreadable": state.unreadable, "unlocated": state.unlocated},
         "arrays": {name: [array.dtype.str, array.shape] for name, array in little.items()},
     }
     yield MAGIC

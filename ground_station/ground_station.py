@@ -24,6 +24,7 @@ from ground_station.keyframe_log import KEYFRAMES_FILE, KeyframeLog
 from ground_station.map_feedback import MapFeedback
 from ground_station.map_service import MapService
 from ground_station.mapper import Mapper, MapUpdate
+from ground_station.pose_errors import PoseErrors
 from ground_station.recording.recorder import RECORDING_FILE, Recorder, recording_path
 from ground_station.recovery import Recovery
 from ground_station.rehearsal import rehearse
@@ -40,6 +41,7 @@ from protocol.metrics_endpoint import MetricsEndpoint
 from protocol.mission import Mission
 from protocol.news import News
 from protocol.replication import Integrated, Replication
+from protocol.separation import SIGMAS
 from protocol.session import Link
 from protocol.synchroniser import Synchroniser, blocks_of
 
@@ -86,6 +88,7 @@ class GroundStation:
         self._recovery = Recovery(mission, bus, run, self._replication, self._jumps, self._feedback, mapper)
         self._clock = clock_of(mission, bus, lockstep=lockstep, now_s=asyncio.get_running_loop().time)
         self._lag = LoopLag()
+        self._pose_errors = PoseErrors()
         self._commands = CommandService(mission, bus, commands, phase=lambda: self._phase, changed=self._obey)
         waits = mission.start == "on_command" and not self._commands.started
         self._phase: Phase = "waiting" if waits else "starting"
@@ -157,6 +160,7 @@ class GroundStation:
 
     async def _step(self, tick: Tick) -> None:
         self._tick = self._news.tick = tick.tick
+        self._pose_errors.hear(tick)
         if self._outdated:
             self._news.tell("error", "phi", f"{self._outdated}: a new epoch begins")
             await self._jumps.renew(self._outdated)
@@ -203,8 +207,11 @@ class GroundStation:
     # --- what goes out -------------------------------------------------------------------------------------------
 
     def _record(self, tick: int, poses: dict[int, list[float]]) -> None:
-        self._run.record_tick(tick, tick * self._mission.tick_s, poses, self._board.states(poses))
-        self._board.note_poses(poses)
+        states, truth = self._board.states(poses), self._pose_errors.truth(tick)
+        allowed_m = {drone: SIGMAS * state.position_sd_m for drone, state in states.items()}
+        self._pose_errors.note(tick, poses, allowed_m)
+        self._run.record_tick(tick, tick * self._mission.tick_s, poses, states, truth)
+        self._board.note_poses(truth or poses)
         if tick % max(1, round(METRICS_PERIOD_S / self._mission.tick_s)) == 0:
             metrics = self._metrics()
             self._run.record_metrics(metrics)
@@ -316,6 +323,8 @@ class GroundStation:
             wall_time_s=self._board.wall_s(now_s),
             exit_reason=self._reason,
             feedback_update_s=self._mapper.feedback_update_s,
+            pose_errors=self._pose_errors.figures,
+            unlocated=self._mapper.unlocated,
         )
         self._recorder.metrics(final)
         self._recorder.finished(summary, mesh)

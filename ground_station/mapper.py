@@ -53,7 +53,9 @@ class MapState:
     end: int
     """... and from which on they are not in this map."""
     unreadable: int
-    """Part of `Mapper.refused`."""
+    """Part of `Mapper.refused` ..."""
+    unlocated: int = 0
+    """... likewise."""
 
 
 class Mapper:
@@ -76,6 +78,8 @@ class Mapper:
         self._truth: Truth | None = None
         self._recent: deque[int] = deque(maxlen=self._reconstructor.lookback)
         self._unreadable = 0
+        self.unlocated = 0
+        """Those of `refused` whose drone did not know well enough where it was."""
         self._compared, self._comparing_s = 0, 0.0
         self.refused = 0
         """Images or poses that could not be read, or that the reconstructor cannot use."""
@@ -90,10 +94,18 @@ class Mapper:
     def _map(self, keyframes: Sequence[messages.Keyframe]) -> None:
         readable = (self._read(message) for message in keyframes)
         self._reconstructor.add([keyframe for keyframe in readable if keyframe is not None])
-        self.refused = self._unreadable + sum(self._reconstructor.statistics().refused.values())
+        self.refused = self._unreadable + self.unlocated + sum(self._reconstructor.statistics().refused.values())
 
     def _read(self, message: messages.Keyframe) -> Keyframe | None:
-        """The keyframe in ``message``; None if it cannot be read, or the camera hardly moved since the last."""
+        """The keyframe in ``message``; None if it cannot be read, its pose is too bad, or the camera hardly moved since
+        the last."""
+        settings = self._mission.localization
+        if (
+            message.position_sd_m > settings.keyframe_deviation_max_m
+            or message.angle_sd_rad > settings.keyframe_deviation_max_rad
+        ):
+            self.unlocated += 1
+            return None
         try:
             keyframe = read_keyframe(message)
         except (ReconstructionError, MessageError, UnidentifiedImageError, OSError, ValueError) as error:
@@ -148,7 +160,7 @@ class Mapper:
         self._log.sync()
         end = self._log.end
         first = self._recent[0] if self._recent else end
-        return MapState(self._reconstructor.state(), first, end, self._unreadable)
+        return MapState(self._reconstructor.state(), first, end, self._unreadable, self.unlocated)
 
     def restore(self, state: MapState | None) -> int:
         """In a new mapper: the map as it was at the checkpoint, then the keyframes that the log has from after it.
@@ -162,7 +174,7 @@ class Mapper:
         """
         if state is not None:
             self._reconstructor.restore(state.reconstruction, self._known(state))
-            self._unreadable = state.unreadable
+            self._unreadable, self.unlocated = state.unreadable, state.unlocated
         count = 0
         later = self._log.read(state.end if state else 0, self._log.end)
         for _, group in itertools.groupby(later, key=lambda found: found[1].tick):

@@ -33,6 +33,7 @@ from ground_station.evaluation import Scores
 from ground_station.journal import JOURNAL_FILE
 from ground_station.mesh_files import Colours, Faces, Vertices, glb, mesh_sha256, ply
 from ground_station.metrics_file import MetricsFile
+from ground_station.pose_errors import PoseErrorFigures
 from ground_station.separation import nearest_distances
 from ground_station.trajectories import Trajectories
 from protocol.errors import MissionError, StorageError
@@ -55,8 +56,8 @@ METRICS_PERIOD_S = 1.0
 DECIMALS = 6
 """Of the figures in metrics.csv and summary.json: micrometres and microseconds."""
 PACKAGES = (
-    "coverage-recon", "eclipse-zenoh", "mavsdk", "msgpack", "numba", "numpy", "open3d", "open3d-cpu", "osqp",
-    "pydantic", "scipy", "torch", "trimesh",
+    "coverage-recon", "eclipse-zenoh", "kiss-icp", "mavsdk", "msgpack", "numba", "numpy", "open3d", "open3d-cpu",
+    "osqp", "pydantic", "scipy", "torch", "trimesh",
 )  # fmt: skip
 """Those whose version may change a result."""
 
@@ -99,6 +100,10 @@ class Summary:
     versions: Mapping[str, str]
     feedback_update_s: float | None = None
     """Mean wall time of one update of the feedback, two meshes to h2; None without feedback."""
+    pose_errors: PoseErrorFigures | None = None
+    """None where a simulator's drones know where they are, or nobody knows the truth."""
+    unlocated: int = 0
+    """Keyframes that were left out of the map because their poses were too bad."""
 
     def as_json(self) -> dict[str, Any]:
         """The content of summary.json: flat where runs are compared, ``null`` for what the run did not have."""
@@ -118,6 +123,8 @@ class Summary:
             "sim_time_s": _rounded(self.final.time_s),
             "wall_time_s": _rounded(self.wall_time_s),
             "feedback_update_s": _rounded(self.feedback_update_s),
+            **_pose_figures(self.pose_errors),
+            "keyframes_unlocated": self.unlocated,
             "phi_sha256": self.phi_sha256,
             "mesh_sha256": self.mesh_sha256,
             "versions": dict(self.versions),
@@ -202,14 +209,16 @@ class RunFolder:
         time_s: float,
         poses: Mapping[int, Sequence[float]],
         states: Mapping[int, DroneState],
+        truth: Mapping[int, Sequence[float]] | None = None,
     ) -> None:
         """Keep one tick; every mapping goes by drone id and may lack drones that were not heard.
 
-        ``poses`` are x, y, z in metres, yaw, pitch in radians; ``states`` the newest heard. Costs some ten
+        ``poses`` are x, y, z in metres, yaw, pitch in radians; ``states`` the newest heard; ``truth`` the true poses
+        where they are known to be others, by which separation is judged. Costs some ten
         microseconds: it is called 200 times a second.
         """
         self._trajectories.add(tick, time_s, poses, states)
-        for drone, distance in nearest_distances(poses).items():
+        for drone, distance in nearest_distances(truth or poses).items():
             self._separations[drone] = min(self._separations[drone], distance)
             self._min_separation = min(self._min_separation, distance)
 
@@ -281,6 +290,8 @@ class RunFolder:
         wall_time_s: float,
         exit_reason: str,
         feedback_update_s: float | None = None,
+        pose_errors: PoseErrorFigures | None = None,
+        unlocated: int = 0,
     ) -> Summary:
         """Write the last checkpoint and the summary; the mesh must have been written before.
 
@@ -306,6 +317,8 @@ class RunFolder:
             mesh_sha256=self._mesh_sha256,
             versions=versions(),
             feedback_update_s=feedback_update_s,
+            pose_errors=pose_errors,
+            unlocated=unlocated,
         )
         text = json.dumps(summary.as_json(), indent=2, allow_nan=False) + "\n"
         self._replace(SUMMARY_FILE, text.encode())
@@ -353,6 +366,11 @@ def _flat(scores: Scores | None) -> dict[str, float | None]:
         **{f"precision_{name}": _rounded(part.precision) if part else None for name, part in parts.items()},
         **{f"recall_{name}": _rounded(part.recall) if part else None for name, part in parts.items()},
     }
+
+
+def _pose_figures(figures: PoseErrorFigures | None) -> dict[str, float | None]:
+    names = ("rms_m", "max_m", "final_m", "yaw_rms_rad", "beyond")
+    return {f"pose_error_{name}": _rounded(getattr(figures, name)) if figures else None for name in names}
 
 
 def _rounded(value: float | None) -> float | None:

@@ -39,8 +39,10 @@ def make_keyframe(
     intrinsics: Intrinsics,
     jpeg: bytes,
     depth: bytes = b"",
+    deviations: tuple[float, float] = (0.0, 0.0),
 ) -> Keyframe:
-    """``position`` (3,) and ``rotation`` (3, 3), camera to world, are those of the camera."""
+    """``position`` (3,) and ``rotation`` (3, 3), camera to world, are those of the camera; ``deviations`` their
+    standard deviations, m and rad."""
     x_row, y_row, z_row = rotation.tolist()
     return Keyframe(
         drone=drone,
@@ -56,4 +58,6 @@ def make_keyframe(
         cy=intrinsics.cy,
         jpeg=jpeg,
         depth=depth,
+        position_sd_m=deviations[0],
+        angle_sd_rad=deviations[1],
     )

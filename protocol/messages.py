@@ -17,6 +17,8 @@ Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
 Vector3 = tuple[Coordinate, Coordinate, Coordinate]
 Vector5 = tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate]
 """x, y, z, camera yaw, camera pitch (depression), or their rates."""
+Deviation = Annotated[float, Field(ge=0, le=1e6)]
+"""Standard deviation, in metres or radians; 0 where nobody tells one."""
 EventLevel = Literal["info", "warning", "error"]
 Text = Annotated[str, Field(max_length=1000)]
 Outcome = Literal["solved", "infeasible", "out_of_time", "numerical", "none"]
@@ -39,6 +41,12 @@ class VehicleSample(Message):
     battery: Annotated[float, Field(ge=0, le=1)]
     setpoint_tick: Annotated[int, Field(ge=-1)]
     """Tick of the setpoint that it flies, -1 before the first: how long a command takes is seen from it."""
+    position_sd_m: Deviation = 0.0
+    """Of the position, along the direction in which it is largest ..."""
+    angle_sd_rad: Deviation = 0.0
+    """... and of the yaw and pitch."""
+    truth: Vector5 | None = None
+    """The true pose, where a simulator's estimates are off; to judge by, never to fly by."""
 
 
 class Tick(Message):
@@ -138,6 +146,10 @@ class DroneState(Message):
     replica: ReplicaState
     control: Control | None
     """The decision of the tick before."""
+    position_sd_m: Deviation = 0.0
+    """Of the position, along the direction in which it is largest: neighbours keep so much farther away ..."""
+    angle_sd_rad: Deviation = 0.0
+    """... and of the yaw and pitch."""
 
     @property
     def landed(self) -> bool:
@@ -167,6 +179,8 @@ class TeamStates(Message):
     """int32 (m,)"""
     earlier_poses: WireArray
     """float64 (m, 5)"""
+    position_sd_m: WireArray | None = None
+    """float64 (n,), as in `DroneState`; None of a router that does not know them."""
 
 
 class Keyframe(Message):
@@ -188,6 +202,20 @@ class Keyframe(Message):
     jpeg: bytes
     depth: bytes = b""
     """What a depth camera measured through the same lens (`protocol.depth_image`); empty without one."""
+    position_sd_m: Deviation = 0.0
+    """Of the position, along the direction in which it is largest ..."""
+    angle_sd_rad: Deviation = 0.0
+    """... and of the angles: poses that are too bad are left out of the map."""
+
+
+class LidarScan(Message):
+    """What one drone's lidar measured at the start of ``tick``."""
+
+    name: ClassVar[str] = "lidar_scan"
+    drone: DroneId
+    tick: TickNumber
+    points: WireArray
+    """int16 (n, 3) millimetres, as seen from the sensor, levelled: x forward along the vehicle's yaw, y left, z up."""
 
 
 class Jump(Message):

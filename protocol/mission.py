@@ -15,6 +15,7 @@ from pydantic import Field, model_validator
 
 from protocol.free_space import start_faults, zone_faults
 from protocol.geometry import Intrinsics
+from protocol.localization_settings import EstimateNoise, Lidar, Localization
 from protocol.operation_settings import Console, Metrics, Recording
 from protocol.planner_settings import PlannerName, Planners, planner_faults
 from protocol.separation import widened_separation
@@ -303,6 +304,7 @@ class Simulation(Settings):
     """Standard deviation, on each axis, of the error of the position that is sent with a keyframe ..."""
     pose_noise_rad: NonNegative = 0.0
     """... and of its attitude. Independent from frame to frame; how the vehicles fly does not change."""
+    estimate: EstimateNoise = EstimateNoise()
     start_patience_s: Positive = 120.0
     """How long the first tick waits for all drones; one that comes later joins in flight."""
 
@@ -364,6 +366,8 @@ class Mission(Settings):
     planners: Planners = Planners()
     feedback: Feedback = Feedback()
     camera: Camera = Camera()
+    localization: Localization = Localization()
+    lidar: Lidar = Lidar()
     reconstruction: Reconstruction = Reconstruction()
     simulation: Simulation = Simulation()
     vehicles: Vehicles = Vehicles()
@@ -383,6 +387,11 @@ class Mission(Settings):
     def measures_depth(self) -> bool:
         """Whether keyframes carry depth."""
         return self.camera.depth or self.reconstruction.backend == "depth"
+
+    @property
+    def scan_ticks(self) -> int:
+        """Between two scans of a lidar."""
+        return round(self.controller.rate_hz / self.lidar.rate_hz)
 
     def sweep_intrinsics(self) -> Intrinsics:
         """Of depth images, computed and measured."""
@@ -448,12 +457,24 @@ class Mission(Settings):
                 for index, drone in enumerate(self.drones)
                 if drone.camera
             ]
+        if self.localization.source == "lidar":
+            faults += self._lidar_faults()
         faults += self.transport.faults()
         if self.reconstruction.nearest_m >= self.reconstruction.farthest_m:
             faults.append("reconstruction.nearest_m: must be less than farthest_m")
         if faults:
             raise ValueError("\n".join(faults))
         return self
+
+    def _lidar_faults(self) -> list[str]:
+        faults = []
+        if self.vehicles.kind != "simulated":
+            faults.append('localization.source: "lidar" has simulated lidars alone; give PX4 its poses (docs/px4.md)')
+        elif not self.simulation.scene:
+            faults.append('localization.source: "lidar" needs a scene to measure, simulation.scene')
+        if self.lidar.rate_hz > self.controller.rate_hz:
+            faults.append(f"lidar.rate_hz: must be at most controller.rate_hz, {self.controller.rate_hz:g}")
+        return faults
 
     def _vehicle_faults(self) -> list[str]:
         """Two agents on one vehicle, two vehicles that MAVSDK would take for one, or two that cannot land at home."""

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from protocol.mission import Flight
 
+SIGMAS = 3
+"""How many standard deviations a position is taken to be off at most: along one direction, in 99.7 % of the cases."""
 ROOT_STEPS = 40
 """Newton steps; from d + lag each at least takes a third off the distance to the root, at the end it squares it."""
 
@@ -17,10 +19,17 @@ def top_speed(flight: Flight) -> float:
     return math.sqrt(3) * flight.speed_max_mps
 
 
-def widened_separation(flight: Flight) -> float:
+def position_error(flight: Flight, deviation_m: float) -> float:
+    """How far an estimate of a position may be off, metres: as the mission says, or as its drone does if that is more;
+    ``deviation_m``: the standard deviation that it tells."""
+    return max(flight.position_error_m, SIGMAS * deviation_m)
+
+
+def widened_separation(flight: Flight, beyond_m: float = 0.0) -> float:
     """Separation D of predicted positions that keeps the drones' positions d apart, metres; d is
-    ``estimated_separation_m``, and two drones close in at twice their top speed."""
-    return widened(flight.estimated_separation_m, 2 * top_speed(flight) * flight.response_time_s)
+    ``estimated_separation_m`` and ``beyond_m``, by which two estimates may be off more than that says, and two drones
+    close in at twice their top speed."""
+    return widened(flight.estimated_separation_m + beyond_m, 2 * top_speed(flight) * flight.response_time_s)
 
 
 def widened(distance_m: float, lag_m: float) -> float:

@@ -32,6 +32,7 @@ class Sighting:
     blind_s: float
     landed: bool
     earlier: Sequence[TimedPose]
+    position_sd_m: float = 0.0
 
 
 def pack(states: Iterable[tuple[DroneState, Sequence[TimedPose]]]) -> TeamStates:
@@ -49,6 +50,7 @@ def pack(states: Iterable[tuple[DroneState, Sequence[TimedPose]]]) -> TeamStates
         earlier_rows=np.array([row for row, _, _ in earlier], np.uint8),
         earlier_ticks=np.array([tick for _, tick, _ in earlier], np.int32),
         earlier_poses=_five([pose for _, _, pose in earlier]),
+        position_sd_m=np.array([state.position_sd_m for state in newest], np.float64),
     )
 
 
@@ -59,6 +61,7 @@ def unpack(message: TeamStates) -> list[Sighting]:
         MessageError: the arrays do not fit each other, or hold what no state may.
     """
     count, repeated = message.drones.size, message.earlier_rows.size
+    deviations = np.zeros(count) if message.position_sd_m is None else message.position_sd_m
     for array, dtype, shape in (
         (message.drones, np.uint8, (count,)),
         (message.ticks, np.int32, (count,)),
@@ -69,6 +72,7 @@ def unpack(message: TeamStates) -> list[Sighting]:
         (message.earlier_rows, np.uint8, (repeated,)),
         (message.earlier_ticks, np.int32, (repeated,)),
         (message.earlier_poses, np.float64, (repeated, 5)),
+        (deviations, np.float64, (count,)),
     ):
         if array.dtype != dtype or array.shape != shape:
             raise MessageError(f"team_states: {array.dtype} of shape {array.shape} instead of {dtype.__name__} {shape}")
@@ -76,6 +80,7 @@ def unpack(message: TeamStates) -> list[Sighting]:
     _require(bool((message.earlier_rows < count).all()), "poses of nobody")
     _require(_within(message.ticks, 0, np.inf) and _within(message.earlier_ticks, 0, np.inf), "a tick before the first")
     _require(_within(message.blind_s, 0, BLIND_MAX_S), "a time without telemetry that is too long")
+    _require(_within(deviations, 0, POSE_MAX), "a standard deviation that is none")
     for array in (message.poses, message.velocities, message.earlier_poses):
         _require(_within(array, -POSE_MAX, POSE_MAX), "a coordinate that is too large")
     earlier: list[list[TimedPose]] = [[] for _ in range(count)]
@@ -83,10 +88,12 @@ def unpack(message: TeamStates) -> list[Sighting]:
         message.earlier_rows.tolist(), message.earlier_ticks.tolist(), message.earlier_poses.tolist(), strict=True
     ):
         earlier[row].append((tick, tuple(pose)))
-    columns = (message.drones, message.ticks, message.poses, message.velocities, message.blind_s, message.landed)
+    columns = (
+        message.drones, message.ticks, message.poses, message.velocities, message.blind_s, message.landed, deviations,
+    )  # fmt: skip
     return [
-        Sighting(drone, tick, tuple(pose), tuple(velocity), blind_s, bool(landed), poses)
-        for drone, tick, pose, velocity, blind_s, landed, poses in zip(
+        Sighting(drone, tick, tuple(pose), tuple(velocity), blind_s, bool(landed), poses, deviation)
+        for drone, tick, pose, velocity, blind_s, landed, deviation, poses in zip(
             *(column.tolist() for column in columns), earlier, strict=True
         )
     ]

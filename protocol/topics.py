@@ -89,6 +89,8 @@ KEYFRAME = Topic("drone/{drone}/keyframe", messages.Keyframe, ("agent", "sim"), 
                  "DATA_LOW", 256, _NO_AGE, True, 12 * _MIB)
 SETPOINT = Topic("drone/{drone}/setpoint", messages.Setpoint, ("agent",), ("sim",),
                  "REAL_TIME", 256, 0.5, True, 1 * _KIB, express=True)
+SCAN = Topic("drone/{drone}/scan", messages.LidarScan, ("sim",), ("agent",),
+             "DATA_HIGH", 4, 0.5, False, 512 * _KIB)
 TICK = Topic("clock/tick", messages.Tick, ("sim",), ("agent", "ground", "operator", "router"),
              "REAL_TIME", 256, 0.5, True, 256 * _KIB, express=True)
 JUMP = Topic("phi/jump", messages.Jump, ("ground",), ("agent", "operator"),
@@ -122,7 +124,7 @@ STATUS = Topic("status", messages.Status, ("ground",), ("operator",),
 # fmt: on
 
 TOPICS: tuple[Topic[Message], ...] = (  # type: ignore[assignment]  # read-only use of an invariant generic
-    STATE, TEAM, KEYFRAME, SETPOINT, TICK, JUMP, HEAD, JOURNAL, DIGEST, BLOCKS, DRONE_BLOCKS, PHASE, COMMAND,
+    STATE, TEAM, KEYFRAME, SETPOINT, SCAN, TICK, JUMP, HEAD, JOURNAL, DIGEST, BLOCKS, DRONE_BLOCKS, PHASE, COMMAND,
     EVENT, GROUND_EVENT, MAP, MAP_KEYFRAMES, EXTERNAL_MESH, STATUS,
 )  # fmt: skip
 

@@ -15,6 +15,7 @@ from protocol.messages import (
     Jump,
     JumpHead,
     Keyframe,
+    LidarScan,
     MissionPhase,
     PhiDigest,
     ReplicaState,
@@ -69,6 +70,8 @@ def state(drone: int) -> DroneState:
         importance=0.456,
         replica=ReplicaState(tick=TICK, epoch=EPOCH, next_jump=321, missing=0, repaired=12, lost=34),
         control=control,
+        position_sd_m=0.0123,
+        angle_sd_rad=0.0123,
     )
 
 
@@ -103,6 +106,11 @@ def tick(mission: Mission) -> Tick:
 
 def setpoint(drone: int) -> Setpoint:
     return Setpoint(drone=drone, tick=TICK, velocity=pose(drone, TICK + 1))
+
+
+def scan(mission: Mission, drone: int) -> LidarScan:
+    """Of which every ray comes back."""
+    return LidarScan(drone=drone, tick=TICK, points=np.zeros((mission.lidar.rays, 3), np.int16))
 
 
 def keyframe(mission: Mission, drone: int, jpeg_bytes: int, depth_bytes: int = 0) -> Keyframe:

@@ -36,7 +36,7 @@ MAX_MEMBERS_IN_ALL = 2**16
 """One byte can be an empty map, which takes Python 64. A message of fewer bytes cannot have more members."""
 PLACE_LETTERS = 40
 """Of each part of a place that an error names: an unknown field's name is whatever the sender made it."""
-_ARRAY_DTYPES = ("<f4", "<f8", "<i4", "|u1")
+_ARRAY_DTYPES = ("<f4", "<f8", "<i2", "<i4", "|u1")
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
@@ -13,7 +13,7 @@ from protocol.bus import Bus
 from protocol.geometry import Floats
 
 if TYPE_CHECKING:
-    from sim_bridge.photographer import Photographer, Shot
+    from sim_bridge.photographer import Photographer, Shot, Sight
 
 log = logging.getLogger(__name__)
 
@@ -33,15 +33,22 @@ class Darkroom:
 
     async def photograph(self, tick: int, poses: Mapping[int, Floats], *, wait: bool) -> None:
         """Take the keyframes that are due at ``tick``; ``poses`` (5,) by drone. ``wait``: until they are sent."""
-        if self._photographer is None:
-            return
-        for shot in self._photographer.due(tick, poses):
+        if self._photographer is not None:
+            await self._take(self._photographer, self._photographer.due(tick, poses), wait=wait)
+
+    async def photograph_believed(self, sights: Iterable[Sight], *, wait: bool) -> None:
+        """Likewise, of drones that do not know quite where they are."""
+        if self._photographer is not None:
+            await self._take(self._photographer, self._photographer.due_of(sights), wait=wait)
+
+    async def _take(self, photographer: Photographer, shots: Iterable[Shot], *, wait: bool) -> None:
+        for shot in shots:
             if wait:
-                await self._shoot(self._photographer, shot)
+                await self._shoot(photographer, shot)
             elif len(self._rendering) >= BACKLOG:
                 self.lost += 1
             else:
-                task = asyncio.create_task(self._shoot(self._photographer, shot))
+                task = asyncio.create_task(self._shoot(photographer, shot))
                 self._rendering.add(task)
                 task.add_done_callback(self._rendering.discard)
 

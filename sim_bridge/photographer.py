@@ -6,8 +6,8 @@ The pose that is sent with one may be off, as that of a real vehicle is.
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -28,10 +28,26 @@ POSE_STREAM: Final = 1
 class Shot:
     """A keyframe that is due but not rendered yet."""
 
-    drone: int
+    sight: Sight
     sequence: int
+
+    @property
+    def drone(self) -> int:
+        return self.sight.drone
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """Where a drone's camera is at a tick, and where its drone believes it to be."""
+
+    drone: int
     tick: int
-    pose: Floats
+    truth: Floats
+    """(5,)"""
+    believed: Floats
+    """(5,)"""
+    deviations: tuple[float, float] = (0.0, 0.0)
+    """Standard deviations of what is believed, m and rad."""
 
 
 class Photographer:
@@ -44,17 +60,23 @@ class Photographer:
 
     def due(self, tick: int, poses: Mapping[int, Floats]) -> list[Shot]:
         """The drones, ascending, whose camera has moved enough since its last keyframe; ``poses`` are (5,)."""
+        return self.due_of(Sight(drone, tick, pose, pose) for drone, pose in sorted(poses.items()))
+
+    def due_of(self, sights: Iterable[Sight]) -> list[Shot]:
+        """Likewise, of cameras that believe that they have moved enough."""
         shots = []
-        for drone, pose in sorted(poses.items()):
-            if self._rules[drone].wants(pose[:3], camera_rotation(pose[3], pose[4])):
-                shots.append(Shot(drone, self._taken[drone], tick, pose.copy()))
-                self._taken[drone] += 1
+        for sight in sights:
+            pose = sight.believed
+            if self._rules[sight.drone].wants(pose[:3], camera_rotation(pose[3], pose[4])):
+                kept = replace(sight, truth=sight.truth.copy(), believed=pose.copy())
+                shots.append(Shot(kept, self._taken[sight.drone]))
+                self._taken[sight.drone] += 1
         return shots
 
     def take(self, shot: Shot) -> Keyframe:
         """Render one; the noise depends on the mission's seed, the drone and the sequence number alone."""
-        settings = self._mission.camera
-        image = self._camera.render(shot.pose.tolist())
+        settings, sight = self._mission.camera, shot.sight
+        image = self._camera.render(sight.truth.tolist())
         generator = np.random.default_rng([self._mission.seed, shot.drone, shot.sequence])
         if self._mission.simulation.image_noise > 0:
             image = add_noise(image, self._mission.simulation.image_noise, generator)
@@ -64,12 +86,13 @@ class Photographer:
         return make_keyframe(
             shot.drone,
             shot.sequence,
-            shot.tick,
+            sight.tick,
             position,
             rotation,
             self._intrinsics,
             jpeg.getvalue(),
             self._measure_depth(shot, generator),
+            sight.deviations,
         )
 
     def _measure_depth(self, shot: Shot, generator: np.random.Generator) -> bytes:
@@ -77,13 +100,13 @@ class Photographer:
         if self._depth_camera is None:
             return b""
         settings = self._mission.simulation
-        depth = self._depth_camera.render_depth(shot.pose.tolist())
+        depth = self._depth_camera.render_depth(shot.sight.truth.tolist())
         return encode_depth(add_depth_noise(depth, settings.depth_noise_m, settings.depth_noise_per_m, generator))
 
     def _told_pose(self, shot: Shot) -> tuple[Floats, Floats]:
-        """The true one, with an error of its own for each keyframe."""
-        settings = self._mission.simulation
-        position, rotation = shot.pose[:3], camera_rotation(shot.pose[3], shot.pose[4])
+        """The one that is believed, with an error of its own for each keyframe."""
+        settings, pose = self._mission.simulation, shot.sight.believed
+        position, rotation = pose[:3], camera_rotation(pose[3], pose[4])
         if settings.pose_noise_m == settings.pose_noise_rad == 0:
             return position, rotation
         dice = np.random.default_rng([self._mission.seed, shot.drone, shot.sequence, POSE_STREAM])

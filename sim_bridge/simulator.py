@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,16 +18,21 @@ import numpy as np
 from protocol import topics
 from protocol.bus import Bus, connect
 from protocol.errors import ProcessError
+from protocol.geometry import Floats
 from protocol.messages import Setpoint, Tick, VehicleSample
 from protocol.metrics_endpoint import MetricsEndpoint
 from protocol.mission import Mission
 from protocol.session import Link
+from sim_bridge.believed import BelievedPoses
 from sim_bridge.darkroom import Darkroom
 from sim_bridge.dynamics import VehicleBody
+from sim_bridge.estimate import EstimateError
 from sim_bridge.observer import Observer
 from sim_bridge.roll_call import MissionWatch, wait_for_everybody
+from sim_bridge.scanner import Scanner
 
 if TYPE_CHECKING:
+    from sim_bridge.lidar import LidarSensor
     from sim_bridge.photographer import Photographer
 
 log = logging.getLogger(__name__)
@@ -44,10 +49,29 @@ CHECK_S = 0.5
 
 
 class Simulator:
-    def __init__(self, mission: Mission, bus: Bus, photographer: Photographer | None, *, lockstep: bool) -> None:
+    def __init__(
+        self,
+        mission: Mission,
+        bus: Bus,
+        photographer: Photographer | None,
+        lidar: LidarSensor | None = None,
+        *,
+        lockstep: bool,
+    ) -> None:
         self._mission, self._bus, self._lockstep = mission, bus, lockstep
         self._darkroom = Darkroom(bus, photographer)
         self._bodies = {drone.id: VehicleBody.at(np.array(drone.start)) for drone in mission.drones}
+        self._scanner = Scanner(bus, lidar, mission.scan_ticks)
+        noise = mission.simulation.estimate
+        self._errors = {
+            drone: EstimateError(noise, mission.seed, drone, mission.tick_s)
+            for drone in self._bodies
+            if not noise.is_silent
+        }
+        self._believed: BelievedPoses | None = None
+        if self._errors or mission.localization.source != "vehicle":
+            self._believed = BelievedPoses()
+            bus.on(topics.STATE, self._believed.hear)
         self._flown = dict.fromkeys(self._bodies, -1)
         self._silent: set[int] = set()
         self._watch = MissionWatch(bus, mission)
@@ -81,9 +105,12 @@ class Simulator:
         began = loop.time()
         try:
             while not self._watch.is_over:
-                self._publish(self._beat())
                 poses = {drone: body.pose for drone, body in self._bodies.items()}
-                await self._darkroom.photograph(self._tick, poses, wait=self._lockstep)
+                if self._believed is not None:
+                    self._believed.note_truth(self._tick, poses)
+                self._publish(self._beat())
+                await self._scanner.scan(self._tick, poses, wait=self._lockstep)
+                await self._photograph(poses)
                 if self._lockstep:
                     await self._wait_for_agents()
                     await self._wait_for_ground()
@@ -92,9 +119,23 @@ class Simulator:
                     self._require_ground(self._mission.replication.ground_patience_s + GROUND_PATIENCE_S)
                 for body in self._bodies.values():
                     body.step(self._mission.tick_s, self._tick * self._mission.tick_s, self._mission.flight)
+                for error in self._errors.values():
+                    error.step()
                 self._tick += 1
         finally:
             self._darkroom.close()
+            self._scanner.close()
+
+    async def _photograph(self, poses: Mapping[int, Floats]) -> None:
+        """What cameras see at ``poses`` (5,), posed where their drones believe to be."""
+        believed = self._believed
+        if believed is None:
+            await self._darkroom.photograph(self._tick, poses, wait=self._lockstep)
+            return
+        if self._lockstep:
+            tick = self._tick
+            await self._stand_still(lambda: believed.has(tick, self._live()), LOCKSTEP_PATIENCE_S)
+        await self._darkroom.photograph_believed(believed.take(), wait=self._lockstep)
 
     def _live(self) -> list[int]:
         return [drone for drone in sorted(self._bodies) if self._is_live(drone)]
@@ -107,16 +148,7 @@ class Simulator:
         if not self._lockstep:
             oldest = self._tick - topics.SETPOINT.max_age_s / self._mission.tick_s
             self._silent = {drone for drone, flown in self._flown.items() if flown < oldest}
-        vehicles = [
-            VehicleSample(
-                drone=drone,
-                pose=tuple(body.pose.tolist()),
-                velocity=tuple(body.velocity.tolist()),
-                battery=1.0,
-                setpoint_tick=self._flown[drone],
-            )
-            for drone, body in sorted(self._bodies.items())
-        ]
+        vehicles = [self._sample(drone, body) for drone, body in sorted(self._bodies.items())]
         return Tick(
             tick=self._tick,
             time_s=self._tick * self._mission.tick_s,
@@ -127,6 +159,28 @@ class Simulator:
             next_jump=self._watch.head.next_sequence,
             keyframes=self._darkroom.sent,
         )
+
+    def _sample(self, drone: int, body: VehicleBody) -> VehicleSample:
+        sample = VehicleSample(
+            drone=drone,
+            pose=tuple(body.pose.tolist()),
+            velocity=tuple(body.velocity.tolist()),
+            battery=1.0,
+            setpoint_tick=self._flown[drone],
+        )
+        if self._believed is None:
+            return sample
+        told: dict[str, object] = {"truth": sample.pose}
+        if self._errors:
+            error = self._errors[drone]
+            position_sd_m, angle_sd_rad = error.deviations
+            told |= {
+                "pose": tuple(error.pose(body.pose).tolist()),
+                "velocity": tuple(error.velocity(body.velocity).tolist()),
+                "position_sd_m": position_sd_m,
+                "angle_sd_rad": angle_sd_rad,
+            }
+        return sample.model_copy(update=told)
 
     def _publish(self, beat: Tick) -> None:
         self._beaten = beat
@@ -174,19 +228,20 @@ class Simulator:
 async def run_simulator(mission: Mission, link: Link, run: Path, *, lockstep: bool) -> None:
     """Simulate the world of ``mission``, or what its cameras see where autopilots fly; what is true of it is left in
     the run folder."""
-    photographer = await asyncio.to_thread(_make_photographer, mission, run)
+    photographer, lidar = await asyncio.to_thread(_make_sensors, mission, run)
     with MetricsEndpoint(mission, "sim"):
         async with connect(link, mission.name, lossless=lockstep) as bus:
             if mission.vehicles.kind == "px4":
                 await Observer(mission, bus, photographer).run()
             else:
-                await Simulator(mission, bus, photographer, lockstep=lockstep).run()
+                await Simulator(mission, bus, photographer, lidar, lockstep=lockstep).run()
 
 
-def _make_photographer(mission: Mission, run: Path) -> Photographer | None:
-    """Load the scene, leave its truth in the run folder, and warm the camera up; None for a mission without a scene."""
+def _make_sensors(mission: Mission, run: Path) -> tuple[Photographer | None, LidarSensor | None]:
+    """Load the scene, leave its truth in the run folder, and warm the camera up; None for a mission without a scene, or
+    without a lidar."""
     if not mission.simulation.scene:
-        return None
+        return None, None
     # Heavy modules that a simulator without a scene does not need.
     from sim_bridge.camera import Camera
     from sim_bridge.photographer import Photographer
@@ -207,4 +262,9 @@ def _make_photographer(mission: Mission, run: Path) -> Photographer | None:
     camera = Camera(scene, mission.camera.intrinsics())
     camera.render(mission.drones[0].start)
     depth_camera = Camera(scene, mission.sweep_intrinsics()) if mission.measures_depth else None
-    return Photographer(mission, camera, depth_camera)
+    photographer = Photographer(mission, camera, depth_camera)
+    if mission.localization.source != "lidar":
+        return photographer, None
+    from sim_bridge.lidar import LidarSensor
+
+    return photographer, LidarSensor(scene, mission.lidar, mission.seed)

@@ -32,7 +32,7 @@ class ScriptedMapper:
         self._marked = marked(field)
         self._seed = seed
         self._updates = 0
-        self.taken = self.refused = 0
+        self.taken = self.refused = self.unlocated = 0
         self.feedback_update_s = None
         """Nothing is compared here."""
 

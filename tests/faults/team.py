@@ -138,9 +138,15 @@ class Team:
         await agent.fly()
 
     async def _fly_simulator(self, member: Member, bus: Bus) -> None:
-        simulator = Simulator(self.mission, bus, None, lockstep=self.lockstep)
+        simulator = self.make_simulator(bus)
         member.shell = simulator
         await simulator.run()
+
+    def make_simulator(self, bus: Bus) -> Simulator:
+        return Simulator(self.mission, bus, None, lockstep=self.lockstep)
+
+    def make_mapper(self) -> Mapper:
+        return cast("Mapper", ScriptedMapper(self.field, self._seed))
 
     async def _fly_ground(self, member: Member, bus: Bus) -> None:
         run = RunFolder(self._folder, self.mission)
@@ -148,7 +154,7 @@ class Team:
         commands = CommandLog(self._folder / COMMANDS_FILE)
         try:
             journal = open_journal(self._folder / JOURNAL_FILE)
-            mapper = cast("Mapper", ScriptedMapper(self.field, self._seed))
+            mapper = self.make_mapper()
             ground = GroundStation(self.mission, bus, run, journal, commands, mapper, recorder, lockstep=self.lockstep)
             member.shell = ground
             await ground.run()
@@ -197,7 +203,7 @@ class Team:
             return
         tick = decode(Tick, payload)
         self.tick = tick.tick
-        places = np.array([vehicle.pose[:3] for vehicle in tick.vehicles])
+        places = np.array([(vehicle.truth or vehicle.pose)[:3] for vehicle in tick.vehicles])
         apart = np.linalg.norm(places[:, None] - places[None], axis=2)[np.triu_indices(len(places), 1)]
         self.min_separation_m = min(self.min_separation_m, *apart.tolist(), math.inf)
 
@@ -211,9 +217,11 @@ class Team:
 
 
 @asynccontextmanager
-async def flying(mission: Mission, folder: Path, seed: int, *, lockstep: bool = False) -> AsyncIterator[Team]:
+async def flying(
+    mission: Mission, folder: Path, seed: int, *, lockstep: bool = False, kind: type[Team] = Team
+) -> AsyncIterator[Team]:
     """A team of which nobody has started; at the end all its processes are ended."""
-    team = Team(mission, folder, seed, lockstep=lockstep)
+    team = kind(mission, folder, seed, lockstep=lockstep)
     with (
         patch.object(zenoh.handlers, "RingChannel", Ring),
         # The journal's epoch is drawn at random; here, the same in every run of a seed.

@@ -48,7 +48,7 @@ def valid(kind: type[Message]) -> st.SearchStrategy[Message]:
 def values(annotation: Any) -> st.SearchStrategy[Any]:
     """Of a field that is annotated so."""
     if annotation == WireArray:
-        return st.sampled_from(["<f4", "<f8", "<i4", "|u1"]).flatmap(finite_arrays)
+        return st.sampled_from(["<f4", "<f8", "<i2", "<i4", "|u1"]).flatmap(finite_arrays)
     origin, inner = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         bounds = {}

@@ -163,6 +163,19 @@ def test_images_that_cannot_be_read_are_counted_across_a_restart(station: Statio
     assert new.mapper.refused == 3
 
 
+@pytest.mark.parametrize("bad", [{"position_sd_m": 0.11}, {"angle_sd_rad": 0.1}])
+def test_images_of_a_drone_that_hardly_knows_where_it_is_are_left_out_and_counted(
+    station: Station, bad: dict[str, float]
+) -> None:
+    station.add([FLIGHT[0].model_copy(update={"position_sd_m": 0.1}), FLIGHT[1].model_copy(update=bad)])
+    assert (station.mapper.refused, station.mapper.unlocated) == (1, 1)
+    state = saved(station.folder, station.mapper.state())
+    new = station.killed()
+    new.mapper.restore(state)
+    assert new.mapper.unlocated == 1
+    assert new.mapper.taken == 2, "they are kept all the same"
+
+
 def test_damage_in_the_log_costs_its_keyframe_and_not_the_map(station: Station) -> None:
     station.add(FLIGHT[:CUT])
     state = saved(station.folder, station.mapper.state())

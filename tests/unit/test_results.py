@@ -21,6 +21,7 @@ from faults.disk import FullDisk, dies, in_child
 from faults.told import told
 from ground_station.evaluation import Score, Scores
 from ground_station.mesh_files import mesh_sha256
+from ground_station.pose_errors import PoseErrorFigures
 from ground_station.results import Metrics, RunFolder, versions
 from protocol.errors import MissionError, StorageError
 from protocol.mission import Drone, Mission
@@ -64,7 +65,8 @@ def fly(run: RunFolder, first: int, last: int) -> None:
 def finish(run: RunFolder, tick: int = 10) -> dict[str, object]:
     run.finish(
         metrics(tick), floor_baseline=FLOOR, phi_sha256="f" * 64, wall_time_s=2.5, exit_reason="duration",
-        feedback_update_s=0.0123,
+        feedback_update_s=0.0123, unlocated=5,
+        pose_errors=PoseErrorFigures(rms_m=0.02, max_m=0.05, final_m=0.01, yaw_rms_rad=0.003, beyond=0.001),
     )  # fmt: skip
     content: dict[str, object] = json.loads((run.path / "summary.json").read_text())
     return content
@@ -103,6 +105,12 @@ def test_a_row_shows_the_nearest_approach_since_the_row_before(folder: RunFolder
     assert finish(folder)["min_separation_m"] == 1.2
 
 
+def test_separation_is_judged_by_the_truth_where_it_is_told(folder: RunFolder) -> None:
+    believed = {1: (0.0, 0.0, 2.0, 0.1, 1.2), 4: (3.0, 0.0, 2.0, 0.2, 1.3)}
+    folder.record_tick(0, 0.0, believed, {}, {1: (0.5, 0.0, 2.0, 0.1, 1.2), 4: (3.0, 0.0, 2.0, 0.2, 1.3)})
+    assert folder.min_separation_m == 2.5
+
+
 def test_what_a_run_does_not_have_stays_empty(tmp_path: Path) -> None:
     alone = MISSION.model_copy(update={"drones": MISSION.drones[:1]})
     run = RunFolder(tmp_path, alone)
@@ -136,6 +144,8 @@ def test_the_summary_holds_every_figure_by_which_runs_are_compared(folder: RunFo
         "recall_visible": 0.8, "recall_exposed": 0.7, "recall_objects": 0.6,
         "min_separation_m": 2.91, "jumps": 3, "keyframes": 42, "fallbacks": {"1": 0, "4": 3}, "ticks": 10,
         "sim_time_s": 0.5, "wall_time_s": 2.5, "feedback_update_s": 0.0123,
+        "pose_error_rms_m": 0.02, "pose_error_max_m": 0.05, "pose_error_final_m": 0.01, "pose_error_yaw_rms_rad": 0.003,
+        "pose_error_beyond": 0.001, "keyframes_unlocated": 5,
         "phi_sha256": "f" * 64, "mesh_sha256": mesh_sha256(VERTICES, FACES),
     }  # fmt: skip
     assert isinstance(baseline, dict)

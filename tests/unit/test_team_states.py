@@ -19,7 +19,13 @@ ticks = st.integers(0, 2**31 - 1)
 
 
 def state(
-    drone: int, tick: int, pose: Vector5, velocity: Vector5 = (0.0,) * 5, blind_s: float = 0.0, mode: Mode = "flying"
+    drone: int,
+    tick: int,
+    pose: Vector5,
+    velocity: Vector5 = (0.0,) * 5,
+    blind_s: float = 0.0,
+    mode: Mode = "flying",
+    position_sd_m: float = 0.0,
 ) -> DroneState:
     return DroneState(
         drone=drone,
@@ -32,6 +38,7 @@ def state(
         importance=1.0,
         replica=NO_REPLICA,
         control=None,
+        position_sd_m=position_sd_m,
     )
 
 
@@ -41,7 +48,15 @@ def told(draw: st.DrawFn) -> list[tuple[DroneState, list[TimedPose]]]:
     modes: st.SearchStrategy[Mode] = st.sampled_from(["flying", "landed"])
     return [
         (
-            state(drone, draw(ticks), draw(poses), draw(poses), draw(st.floats(0, 60)), draw(modes)),
+            state(
+                drone,
+                draw(ticks),
+                draw(poses),
+                draw(poses),
+                draw(st.floats(0, 60)),
+                draw(modes),
+                draw(st.floats(0, 10)),
+            ),
             draw(st.lists(st.tuples(ticks, poses), max_size=4)),
         )
         for drone in sorted(ids)
@@ -53,7 +68,16 @@ def test_all_that_the_others_fly_by_comes_out_to_the_last_bit(told: list[tuple[D
     sightings = unpack(decode(TeamStates, encode(pack(told))))
 
     assert sightings == [
-        Sighting(state.drone, state.tick, state.pose, state.velocity, state.blind_s, state.mode == "landed", earlier)
+        Sighting(
+            state.drone,
+            state.tick,
+            state.pose,
+            state.velocity,
+            state.blind_s,
+            state.mode == "landed",
+            earlier,
+            state.position_sd_m,
+        )
         for state, earlier in told
     ]
 
@@ -95,3 +119,18 @@ def test_arrays_that_do_not_fit_or_hold_what_no_state_may_are_refused(field: str
     unpack(SOUND)
     with pytest.raises(MessageError, match="team_states"):
         unpack(SOUND.model_copy(update={field: array}))
+
+
+def test_a_router_that_knows_no_deviations_leaves_them_at_none() -> None:
+    told = pack([(state(3, 7, (1.0, 2.0, 3.0, 0.1, 1.3), position_sd_m=0.4), [])])
+    older = told.model_copy(update={"position_sd_m": None})
+
+    assert unpack(decode(TeamStates, encode(older)))[0].position_sd_m == 0.0
+
+
+@pytest.mark.parametrize("wrong", [np.zeros(2), np.full(1, -0.1), np.zeros(1, np.float32)])
+def test_deviations_that_cannot_be_are_refused(wrong: np.ndarray) -> None:
+    told = pack([(state(3, 7, (1.0, 2.0, 3.0, 0.1, 1.3)), [])])
+
+    with pytest.raises(MessageError):
+        unpack(told.model_copy(update={"position_sd_m": wrong}))

@@ -16,6 +16,7 @@ from protocol import topics, traffic_samples
 from protocol.formation import formation
 from protocol.geometry import camera_rotation
 from protocol.keyframe_rule import KeyframeRule
+from protocol.localization_settings import Localization
 from protocol.mission import Camera, Drone, Flight, Mission
 from protocol.mission_file import mission_to_toml
 from protocol.topics import TOPICS
@@ -56,7 +57,7 @@ def with_camera(count: int) -> Mission:
 def test_every_topic_of_an_agent_is_planned_or_known_to_be_irregular() -> None:
     planned = {
         (flow.topic, flow.direction)
-        for mission in (team(4), team(9), with_camera(2))
+        for mission in (team(4), team(9), with_camera(2), team(1, localization=Localization(source="lidar")))
         for flow in traffic_of(mission, 1).flows
     }
     regular = [topic for topic in TOPICS if topic not in IRREGULAR]
@@ -79,6 +80,7 @@ def test_samples_are_messages_that_travel() -> None:
         traffic_samples.team_states(mission),
         traffic_samples.tick(mission),
         traffic_samples.setpoint(9),
+        traffic_samples.scan(mission, 9),
         traffic_samples.keyframe(mission, 9, 1000),
         traffic_samples.head(),
         traffic_samples.phase(),

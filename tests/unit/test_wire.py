@@ -27,6 +27,7 @@ from protocol.messages import (
     JumpHead,
     Keyframe,
     KeyframePage,
+    LidarScan,
     MeshBlock,
     MeshPage,
     MissionPhase,
@@ -154,6 +155,7 @@ EXAMPLES: tuple[Message, ...] = (
         earlier_ticks=np.array([41], np.int32),
         earlier_poses=np.array([[1.5, 2.5, 3.0, 0.5, 1.25]]),
     ),
+    LidarScan(drone=2, tick=12, points=np.array([[100, -20, 30], [5, 6, -32000]], np.int16)),
     Status(
         phase="flying",
         activity="mapping",
