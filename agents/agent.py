@@ -24,6 +24,7 @@ from agents.agent_metrics import AgentMetrics
 from agents.cameras.choice import make_feed
 from agents.hearing import Hearing
 from agents.homing import Homecoming
+from agents.localization.choice import make_pose_source
 from agents.orders import Orders
 from agents.planners.choice import make_planner
 from agents.planners.planner import Decision
@@ -102,6 +103,7 @@ class Agent:
         self._news = News(bus, topics.EVENT, f"drone/{drone}", drone)
         self._hearing = Hearing(mission, drone, bus, self._replication, self._team, self._news.tell, lockstep=lockstep)
         self._vehicle = make_vehicle(mission, drone, bus, now_s=self._clock.now_s, events=self._note_event)
+        self._poses = make_pose_source(mission, drone, bus, lockstep=lockstep)
         self._orders = Orders(mission, self._clock.now_s, self._news.tell)
         self._operator = DroneOrder(drone=drone, action="fly", number=0)
         self._feed = make_feed(mission, drone, bus, now_s=self._clock.now_s)
@@ -142,6 +144,7 @@ class Agent:
             ProcessError: the simulator that carried the vehicle is gone.
         """
         try:
+            self._poses.prepare()
             await self._vehicle.prepare()
             if self._feed is not None:
                 self._feed.start()
@@ -155,6 +158,7 @@ class Agent:
         finally:
             if self._feed is not None:
                 await asyncio.to_thread(self._feed.close)
+            self._poses.close()
             self._vehicle.close()
         log.info("drone %d: finished: %s", self._drone, self._finished)
 
@@ -205,7 +209,8 @@ class Agent:
             self._earlier.extend((tick.tick, own.pose) for own in tick.vehicles if own.drone == self._drone)
             return
         self._hearing.look()
-        telemetry, condition = self._vehicle.telemetry(), self._vehicle.condition()
+        telemetry = await self._poses.locate(tick.tick, self._vehicle.telemetry())
+        condition = self._vehicle.condition()
         order = self._give_orders(telemetry, condition)
         if condition.authority == "ready" and not self._finished and order.action == "wait":
             self._vehicle.take_off()  # the first tick is the order to start
@@ -218,7 +223,7 @@ class Agent:
         self.mode = mode = self._mode(condition, order)
         self._publish(telemetry, tick.tick, mode)
         if self._feed is not None and condition.authority == "ours":
-            self._feed.note_pose(telemetry.stamp_s, tick.tick, telemetry.pose, telemetry.rotation)
+            self._feed.note_pose(telemetry.stamp_s, tick.tick, telemetry.pose, telemetry.rotation, telemetry.deviations)
         terms = await self._advance(tick)
         if condition.authority != "ours":
             self._watchdog.feed()  # nothing is to be flown
@@ -280,7 +285,7 @@ class Agent:
         return self._replication.terms()
 
     def _decide(self, telemetry: Telemetry, tick: Tick, mode: Mode, terms: SamplingTerms) -> Decision:
-        neighbours = self._team.neighbours(tick.tick, telemetry.delay_s)
+        neighbours = self._team.neighbours(tick.tick, telemetry.delay_s, telemetry.position_sd_m)
         if mode in ("returning", "landing"):
             return self._homecoming.steer(
                 telemetry.pose, telemetry.velocity, neighbours, home=mode == "returning", now_s=self._clock.now_s()
@@ -335,6 +340,8 @@ class Agent:
             importance=self._replication.importance,
             replica=self._replication.state(),
             control=self._control,
+            position_sd_m=telemetry.position_sd_m,
+            angle_sd_rad=telemetry.angle_sd_rad,
         )
 
     def _report(self, tick: int, decision: Decision, sent: Floats, solve_s: float, age_s: float) -> None:

@@ -30,6 +30,9 @@ class Neighbour:
     """(3,) metres, predicted: p + tau v at the time of its state."""
     age_s: float
     """Beyond the tick at hand; 0 when its state is of this very tick."""
+    error_m: float = 0.0
+    """How much more than the mission says the two positions may be off, this drone's own and its; they keep so much
+    farther apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +81,7 @@ class Barriers:
         self._faces = np.concatenate([flight.lower_m, np.negative(flight.upper_m)])
         self._region = np.zeros((FIXED_ROWS, 5))
         self._region[1:4, :3], self._region[4:7, :3] = np.eye(3), -np.eye(3)
+        self._flight = flight
         self._wide, self._top_speed = widened_separation(flight), top_speed(flight)
         self._airspace = airspace_of(flight)
         # A zone that is farther away is no limit: not even at top speed does its barrier shrink as fast as it may.
@@ -94,11 +98,12 @@ class Barriers:
         region: b = distance inside each of the six faces.
         separation:<id>: one per neighbour (departure 7), b = |dy|^2 - D^2. Each drone's own velocity may shrink b by
         gain b; two that approach each other shrink it by twice that, and it still never becomes negative. A neighbour
-        that has been silent for ``age`` keeps its place, and D grows by ``age`` times its top speed.
+        that has been silent for ``age`` keeps its place, and D grows by ``age`` times its top speed; and by what the
+        two estimates may be off beyond what the mission says.
         zone:<name>: one per convex part of a zone that may be a limit, b = distance from it less D.
         """
         positions = np.array([neighbour.position for neighbour in neighbours]).reshape(-1, 3)
-        distances = np.array([self._wide + neighbour.age_s * self._top_speed for neighbour in neighbours])
+        distances = np.array([self._distance(neighbour) for neighbour in neighbours])
         coefficients, barriers = _rows(
             predicted, positions, distances, self._region, self._faces, self._pitch_mid, self._pitch_reach
         )
@@ -116,6 +121,10 @@ class Barriers:
             np.concatenate([rows.bounds, -self._gain * found.values_m]),
             np.concatenate([rows.barriers, found.values_m]),
         )
+
+    def _distance(self, neighbour: Neighbour) -> float:
+        wide = widened_separation(self._flight, neighbour.error_m) if neighbour.error_m > 0 else self._wide
+        return wide + neighbour.age_s * self._top_speed
 
     def velocity_bounds(self, velocity: Floats) -> tuple[Floats, Floats]:
         """Lower and upper bound of u, (5,) each: the input box U, and no more acceleration than the vehicle has.

@@ -23,6 +23,8 @@ class Orders:
         self._telemetry_silence, self._ground_silence = WitnessedSilence(), WitnessedSilence()
         self._starting_since_s = math.inf
         self._jumps, self._jumped_at_s = 0, -math.inf
+        self._deviation_max_m = mission.localization.deviation_max_m
+        self._sure_at_s = math.inf
         self.newest = Order("fly")
 
     @property
@@ -45,6 +47,9 @@ class Orders:
             self._starting_since_s = now_s
         if condition.jumps > self._jumps:
             self._jumps, self._jumped_at_s = condition.jumps, now_s
+        deviation_m = 0.0 if telemetry is None else telemetry.position_sd_m
+        if not deviation_m > self._deviation_max_m or self._sure_at_s > now_s:
+            self._sure_at_s = now_s
         situation = Situation(
             authority=condition.authority,
             authority_reason=condition.reason,
@@ -53,6 +58,8 @@ class Orders:
             telemetry_age_s=math.inf if telemetry is None else self._telemetry_silence.look(telemetry.stamp_s, now_s),
             outside_m=0.0 if telemetry is None else outside_m(self._flight, telemetry.pose[:3].tolist()),
             jump_age_s=now_s - self._jumped_at_s,
+            position_sd_m=deviation_m,
+            unsure_s=now_s - self._sure_at_s,
             gimbal_lost=condition.gimbal_lost,
             ground_away_s=0.0 if ground_silent_s is None else self._ground_silence.look(*ground_silent_s),
             finished=finished,

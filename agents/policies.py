@@ -47,6 +47,10 @@ class Situation:
     """Distance from the flight region (`outside_m`); 0 inside."""
     jump_age_s: float = math.inf
     """Since the position estimate jumped last."""
+    position_sd_m: float = 0.0
+    """Standard deviation of the position ..."""
+    unsure_s: float = 0.0
+    """... and for how long it has been larger than allowed."""
     gimbal_lost: bool = False
     ground_away_s: float = 0.0
     """Since the ground station was heard last; always 0 in lockstep, which waits instead."""
@@ -151,6 +155,16 @@ POLICIES: tuple[Policy, ...] = (
         lasts=True,
     ),
     Policy(
+        "position lost",
+        "the standard deviation of the position was above `localization.deviation_max_m` for `localization.lost_s`",
+        judged=_OURS,
+        holds=lambda mission, now: now.unsure_s > mission.localization.lost_s,
+        action=lambda _mission: "land",
+        then="land here",
+        reason=lambda now: f"position known to {now.position_sd_m:.2f} m",
+        lasts=True,
+    ),
+    Policy(
         "mission end",
         "the mission is over",
         judged=_ON_ITS_WAY,
@@ -226,6 +240,16 @@ POLICIES: tuple[Policy, ...] = (
         action=lambda _mission: "hold",
         then=f"hold until it has been steady for {ESTIMATE_STEADY_S:g} s; a return waits",
         reason=lambda _now: "the position estimate jumped",
+        blind=True,
+    ),
+    Policy(
+        "position unsure",
+        "the standard deviation of the position is above `localization.deviation_max_m`",
+        judged=_OURS,
+        holds=lambda mission, now: now.position_sd_m > mission.localization.deviation_max_m,
+        action=lambda _mission: "hold",
+        then="hold until it is known better; a return waits",
+        reason=lambda now: f"position known to {now.position_sd_m:.2f} m",
         blind=True,
     ),
     Policy(

@@ -10,6 +10,7 @@ import numpy as np
 from agents.barriers import Neighbour, predicted_pose
 from protocol.messages import DroneState
 from protocol.mission import Flight
+from protocol.separation import position_error
 from protocol.team_states import Sighting
 
 
@@ -21,6 +22,7 @@ class _Seen:
     blind_s: float = 0.0
     landed: bool = False
     """Then it stays where it is, also when its process has ended."""
+    position_sd_m: float = 0.0
 
 
 class Team:
@@ -37,17 +39,25 @@ class Team:
         known = self._last_seen.get(state.drone)
         if state.drone != self._own and (known is None or known.tick <= state.tick):
             tick = min(state.tick, now + 1)
-            self._last_seen[state.drone] = _Seen(tick, state.pose, state.velocity, state.blind_s, state.landed)
+            self._last_seen[state.drone] = _Seen(
+                tick, state.pose, state.velocity, state.blind_s, state.landed, state.position_sd_m
+            )
 
-    def neighbours(self, tick: int, delay_s: float = 0.0) -> list[Neighbour]:
+    def neighbours(self, tick: int, delay_s: float = 0.0, position_sd_m: float = 0.0) -> list[Neighbour]:
         """All the others at ``tick``, ascending by id; the longer silent, the larger, and the longer ``delay_s``, the
-        time until a command is flown: until then either may move on."""
+        time until a command is flown: until then either may move on. ``position_sd_m``: this drone's own."""
         others = sorted(self._last_seen.items())
         poses = np.array([seen.pose for _, seen in others]).reshape(-1, 5)
         velocities = np.array([seen.velocity for _, seen in others]).reshape(-1, 5)
         predicted = predicted_pose(poses, velocities, self._flight)
+        own_m = position_error(self._flight, position_sd_m) - 2 * self._flight.position_error_m
         return [
-            Neighbour(drone, predicted[row, :3], self._silence_s(seen, tick) + delay_s)
+            Neighbour(
+                drone,
+                predicted[row, :3],
+                self._silence_s(seen, tick) + delay_s,
+                own_m + position_error(self._flight, seen.position_sd_m),
+            )
             for row, (drone, seen) in enumerate(others)
         ]
 

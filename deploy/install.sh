@@ -123,7 +123,7 @@ if [[ ${1:-} == tests ]]; then
     install_browser
     install_hosts
     echo "install: test tools, about 1 GB more"
-    install_packages "$python" --editable '.[ground,camera]' --group dev
+    install_packages "$python" --editable '.[ground,camera,lidar]' --group dev
     install_torch
 else
     echo "install: about 1 GB into .venv, once; a few minutes"

@@ -82,10 +82,17 @@ class CameraFeed:
             self._thread.join(CLOSE_S)
         self._camera.close()
 
-    def note_pose(self, stamp_s: float, tick: int, pose: Floats, rotation: Floats | None = None) -> None:
+    def note_pose(
+        self,
+        stamp_s: float,
+        tick: int,
+        pose: Floats,
+        rotation: Floats | None = None,
+        deviations: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
         """From any thread, each tick: the vehicle's estimate of ``stamp_s``, as in `agents.vehicles.vehicle.Telemetry`.
         Without poses there are no keyframes: none are noted where none are wanted."""
-        self._poses.note(stamp_s, tick, pose, rotation)
+        self._poses.note(stamp_s, tick, pose, rotation, deviations)
 
     # --- the thread ----------------------------------------------------------------------------------------------
 
@@ -145,6 +152,7 @@ class CameraFeed:
             moment.rotation,
             self._intrinsics,
             self._jpeg(image),
+            deviations=moment.deviations,
         )
 
     def _jpeg(self, image: NDArray[np.uint8]) -> bytes:

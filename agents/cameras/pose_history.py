@@ -32,6 +32,8 @@ class Moment:
     """(5,), world frame."""
     rotation: Floats
     """(3, 3), camera to world."""
+    deviations: tuple[float, float] = (0.0, 0.0)
+    """Standard deviations of position and angles, m and rad."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +42,7 @@ class _Entry:
     tick: int
     pose: Floats
     rotation: Floats | None
+    deviations: tuple[float, float]
 
 
 class PoseHistory:
@@ -49,10 +52,17 @@ class PoseHistory:
         self._entries: list[_Entry] = []
         self._noted = threading.Condition()
 
-    def note(self, stamp_s: float, tick: int, pose: Floats, rotation: Floats | None = None) -> None:
+    def note(
+        self,
+        stamp_s: float,
+        tick: int,
+        pose: Floats,
+        rotation: Floats | None = None,
+        deviations: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
         """``pose`` (5,) was true at ``stamp_s``; ``rotation`` (3, 3) is the camera's, None: that of the pose. A stamp
         that is no later than the last one, as of telemetry that stands still, adds nothing."""
-        entry = _Entry(stamp_s, tick, pose.copy(), None if rotation is None else rotation.copy())
+        entry = _Entry(stamp_s, tick, pose.copy(), None if rotation is None else rotation.copy(), deviations)
         with self._noted:
             if self._entries and stamp_s <= self._entries[-1].stamp_s:
                 return
@@ -77,7 +87,7 @@ class PoseHistory:
             return _between(before[0], after[0], stamp_s)
         for nearest in (*before, *after):
             if abs(stamp_s - nearest.stamp_s) <= BEYOND_MAX_S:
-                return Moment(nearest.tick, nearest.pose, _rotation(nearest))
+                return Moment(nearest.tick, nearest.pose, _rotation(nearest), nearest.deviations)
         return None
 
 
@@ -94,10 +104,11 @@ def _between(before: _Entry, after: _Entry, stamp_s: float) -> Moment | None:
     change[3] = math.remainder(change[3], math.tau)  # the short way round
     pose = before.pose + share * change
     pose[3] = math.remainder(pose[3], math.tau)
+    deviations = max(before.deviations[0], after.deviations[0]), max(before.deviations[1], after.deviations[1])
     if before.rotation is None and after.rotation is None:
-        return Moment(before.tick, pose, camera_rotation(pose[3], pose[4]))
+        return Moment(before.tick, pose, camera_rotation(pose[3], pose[4]), deviations)
     ends = Rotation.from_matrix(np.stack([_rotation(before), _rotation(after)]))
-    return Moment(before.tick, pose, Slerp([0.0, 1.0], ends)(share).as_matrix())
+    return Moment(before.tick, pose, Slerp([0.0, 1.0], ends)(share).as_matrix(), deviations)
 
 
 def _rotation(entry: _Entry) -> Floats:

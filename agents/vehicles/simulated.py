@@ -38,6 +38,8 @@ class SimulatedVehicle:
                     sample.battery,
                     self._now_s(),
                     self._delay_s(tick.tick, sample.setpoint_tick),
+                    position_sd_m=sample.position_sd_m,
+                    angle_sd_rad=sample.angle_sd_rad,
                 )
                 self._tick = tick.tick
 

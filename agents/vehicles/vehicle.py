@@ -27,6 +27,15 @@ class Telemetry:
     """How much longer than one tick it takes until a command is flown."""
     rotation: Floats | None = None
     """(3, 3) camera to world, where the camera tilts with the airframe; None: that of the pose."""
+    position_sd_m: float = 0.0
+    """Standard deviation of the position, along the direction in which it is largest; 0 where nobody tells one ..."""
+    angle_sd_rad: float = 0.0
+    """... and of yaw and pitch."""
+
+    @property
+    def deviations(self) -> tuple[float, float]:
+        """Both."""
+        return self.position_sd_m, self.angle_sd_rad
 
 
 @dataclass(frozen=True, slots=True)

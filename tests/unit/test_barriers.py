@@ -40,7 +40,7 @@ BARRIERS = Barriers(mission())
 LOW, HIGH = FLIGHT.pitch_limits_rad
 NEIGHBOURS = (
     Neighbour(4, np.array([1.6, -0.3, 2.2]), 0.0),
-    Neighbour(7, np.array([-1.0, 2.0, 1.0]), AGE_S),
+    Neighbour(7, np.array([-1.0, 2.0, 1.0]), AGE_S, error_m=0.3),
 )
 reproducible = settings(max_examples=200, deadline=None, derandomize=True)
 poses = st.tuples(
@@ -55,7 +55,7 @@ def strong(speed: float, response: float) -> dict[str, float]:
 
 
 def separation(neighbour: Neighbour) -> Callable[[Floats], float]:
-    distance = widened_separation(FLIGHT) + top_speed(FLIGHT) * neighbour.age_s
+    distance = widened_separation(FLIGHT, neighbour.error_m) + top_speed(FLIGHT) * neighbour.age_s
     return lambda pose: math.dist(pose[:3], neighbour.position) ** 2 - distance**2
 
 
@@ -134,6 +134,12 @@ def test_the_widened_separation_is_the_root_of_its_equation(separation_m: float,
 
 def test_without_a_lag_the_separation_is_that_of_the_mission() -> None:
     assert widened_separation(Flight(response_time_s=0.0, separation_m=1.25)) == 1.25
+
+
+def test_what_estimates_may_be_off_counts_as_separation() -> None:
+    told = widened_separation(FLIGHT, 0.4)
+    assert told == widened_separation(FLIGHT.model_copy(update={"position_error_m": FLIGHT.position_error_m + 0.2}))
+    assert told > widened_separation(FLIGHT) + 0.3
 
 
 def test_the_prediction_is_where_a_lagging_vehicle_comes_to_rest() -> None:

@@ -45,6 +45,7 @@ IN_FLIGHT: dict[str, tuple[dict[str, Any], dict[str, Any], Action]] = {
     "operator: land": ({"operator": "land"}, {"operator": "fly"}, "land"),
     "battery critical": ({"battery": 0.1}, {"battery": 0.25 + BIT}, "land"),
     "geofence": ({"outside_m": 0.5 + BIT}, {"outside_m": 0.5}, "land"),
+    "position lost": ({"unsure_s": 5.0 + BIT}, {"unsure_s": 5.0}, "land"),
     "mission end": ({"finished": "J fell below 0.5"}, {"finished": ""}, "return"),
     "operator: return": ({"operator": "return"}, {"operator": "fly"}, "return"),
     "battery low": ({"battery": 0.25}, {"battery": 0.25 + BIT}, "return"),
@@ -57,6 +58,7 @@ IN_FLIGHT: dict[str, tuple[dict[str, Any], dict[str, Any], Action]] = {
         {"jump_age_s": ESTIMATE_STEADY_S},
         "hold",
     ),
+    "position unsure": ({"position_sd_m": 0.2 + BIT}, {"position_sd_m": 0.2}, "hold"),
 }
 """What makes a row hold, what nearly does, and its order; the upper row is named when two order the same."""
 FOR_GOOD = {
@@ -64,13 +66,14 @@ FOR_GOOD = {
     "operator: land",
     "battery critical",
     "geofence",
+    "position lost",
     "mission end",
     "operator: return",
     "battery low",
     "gimbal lost",
 }
 OPERATORS = {"operator: land", "operator: return", "operator: pause"}
-BLIND = {"telemetry stale", "estimate jumped"}
+BLIND = {"telemetry stale", "estimate jumped", "position unsure"}
 BY_AUTHORITY: dict[Authority, tuple[str, Action]] = {
     "ready": ("not ours yet", "wait"),
     "starting": ("not ours yet", "wait"),

@@ -9,12 +9,13 @@ import pytest
 
 from agents.policies import policy_table
 
-SCENARIOS = Path("tests/scenario/test_px4_failures.py")
+SCENARIOS = (Path("tests/scenario/test_px4_failures.py"), Path("tests/scenario/test_localization.py"))
 
 BATTERIES = "test_batteries_a_gimbal_and_a_pilot"
 TELEMETRY = "test_telemetry_an_estimate_a_fence_and_a_refusal"
 PROCESSES = "test_an_agent_stopped_one_killed_and_the_ground_station_lost"
 OPERATOR = "test_an_operator_pauses_returns_and_lands_drones"
+LOST = "test_drones_that_no_longer_know_where_they_are_hold_and_then_land"
 CUT = "test_the_others_fly_on_and_land_when_a_link_is_cut_for_good"
 
 SHOWN_BY = {
@@ -23,6 +24,8 @@ SHOWN_BY = {
     "telemetry lost": CUT,
     "battery critical": BATTERIES,
     "geofence": TELEMETRY,
+    "position lost": LOST,
+    "position unsure": LOST,
     "mission end": PROCESSES,
     "battery low": BATTERIES,
     "gimbal lost": BATTERIES,
@@ -39,8 +42,12 @@ SHOWN_BY = {
 @pytest.fixture
 def scenarios(root_path: Path) -> dict[str, str]:
     """Docstrings by the names of the tests."""
-    module = ast.parse((root_path / SCENARIOS).read_text())
-    tests = [node for node in module.body if isinstance(node, ast.AsyncFunctionDef) and node.name.startswith("test_")]
+    nodes = [node for path in SCENARIOS for node in ast.parse((root_path / path).read_text()).body]
+    tests = [
+        node
+        for node in nodes
+        if isinstance(node, ast.AsyncFunctionDef | ast.FunctionDef) and node.name.startswith("test_")
+    ]
     return {test.name: ast.get_docstring(test) or "" for test in tests}
 
 

@@ -128,3 +128,24 @@ def test_one_whose_agent_is_blind_grows_by_what_it_may_have_flown_and_no_further
     for tick in (8, 48, 88):
         known.hear(state(1, tick, x=3.0).model_copy(update={"mode": "yielded", "blind_s": 1.5}), now=tick)
         assert known.neighbours(tick)[0].age_s == pytest.approx(1.5)
+
+
+def told(drone: int, tick: int, x: float, position_sd_m: float) -> DroneState:
+    return state(drone, tick, x).model_copy(update={"position_sd_m": position_sd_m})
+
+
+def test_neighbours_keep_as_much_farther_away_as_both_estimates_may_be_off() -> None:
+    known = team()
+    known.hear(told(1, 8, 3.0, 0.1), now=8)
+
+    assert [neighbour.error_m for neighbour in known.neighbours(8)] == pytest.approx([0.3, 0.0])
+    assert [neighbour.error_m for neighbour in known.neighbours(8, position_sd_m=0.2)] == pytest.approx([0.9, 0.6])
+
+
+def test_of_what_the_mission_and_a_drone_say_of_its_error_the_larger_counts() -> None:
+    known = Team(2, STARTS, FLIGHT.model_copy(update={"position_error_m": 0.25}), TICK_S)
+    known.hear(told(1, 8, 3.0, 0.05), now=8)
+    known.hear(told(5, 8, 4.0, 0.1), now=8)
+
+    assert [neighbour.error_m for neighbour in known.neighbours(8)] == pytest.approx([0.0, 0.05])
+    assert known.neighbours(8, position_sd_m=0.1)[0].error_m == pytest.approx(0.05)

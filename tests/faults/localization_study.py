@@ -1,0 +1,270 @@
+"""How well drones know where they are, by what tells them, and what that does to the map: docs/localization.md.
+
+    PYTHONPATH=.:tests .venv/bin/python -m faults.localization_study FOLDER [SECONDS]
+
+Flies along a given path with each sensor, then the same mission with each source of poses. What lies in FOLDER already
+is not flown again.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from agents.localization.pose_filter import PoseFilter, largest_deviation
+from agents.localization.registration import MAP_SD_M, MAP_SD_RAD, ScanRegistration
+from faults.located_team import located
+from faults.virtual_loop import run
+from ground_station.keyframe_log import NoKeyframes
+from ground_station.mapper import Mapper
+from protocol.field import VirtualField
+from protocol.geometry import Floats
+from protocol.localization_settings import EstimateNoise, Lidar, Localization
+from protocol.messages import Keyframe
+from protocol.mission import Drone, Feedback, Mission, Simulation
+from protocol.operation_settings import Recording
+from protocol.separation import SIGMAS
+from sim_bridge.camera import Camera
+from sim_bridge.estimate import EstimateError
+from sim_bridge.lidar import LidarSensor, directions, measure
+from sim_bridge.photographer import Photographer
+from sim_bridge.scenes.cache import scene_cache
+from sim_bridge.scenes.lighting import ray_caster
+from sim_bridge.scenes.scene import load_scene
+from sim_bridge.scenes.truth import write_truth
+
+Pattern = Callable[[np.random.Generator, Lidar], Floats]
+
+TICK_S = 0.05
+SCAN_TICKS = 2
+SCENE = "living_room"
+NOISE = EstimateNoise(drift_m=0.05, drift_rad=0.01, velocity_mps=0.03, white_m=0.005, white_rad=0.002)
+"""Of the vehicle: visual-inertial odometry or optical flow indoors. With KISS-ICP, of its velocity the same."""
+SECONDS = (60, 300)
+PAGE = Path("docs/localization.md")
+BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """One flight along the path."""
+
+    final_m: float
+    rms_m: float
+    max_m: float
+    yaw_max_rad: float
+    told_m: float
+    """Mean standard deviation that was told."""
+    beyond: float
+    """Share of ticks with an error of more than `SIGMAS` of it."""
+    refused: int
+    scan_ms: float
+    scan_p95_ms: float
+
+
+# --- sensors ---------------------------------------------------------------------------------------------------------
+
+
+def rings(_generator: np.random.Generator, lidar: Lidar) -> Floats:
+    """Forty rings that are the same in every scan."""
+    count = lidar.rays // 40
+    low, high = lidar.elevation_rad
+    elevation, azimuth = (
+        grid.ravel()
+        for grid in np.meshgrid(np.linspace(low, high, 40), np.linspace(-math.pi, math.pi, count, endpoint=False))
+    )
+    across = np.cos(elevation)
+    return np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)])
+
+
+def depth_camera(generator: np.random.Generator, lidar: Lidar) -> Floats:
+    """Random pixels of one that looks down, 74 by 45 degrees."""
+    image = generator.uniform(-1.0, 1.0, (lidar.rays, 2)) * (0.42, 0.75)
+    rays = np.column_stack([image, -np.ones(lidar.rays)])
+    unit: Floats = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return unit
+
+
+SENSORS: Mapping[str, Pattern | None] = {
+    "vehicle's estimate": None,
+    "non-repetitive lidar": directions,
+    "fixed rings": rings,
+    "depth camera that looks down": depth_camera,
+}
+
+
+# --- along a path ----------------------------------------------------------------------------------------------------
+
+
+def path(time_s: float) -> Floats:
+    """(5,) round and round the room at 0.4 m/s in the mean, 0.6 at most, turning all the time."""
+    return np.array([
+        1.8 * math.sin(0.28 * time_s),
+        1.5 * math.cos(0.2 * time_s) - 0.5,
+        1.6 + 0.5 * math.sin(0.15 * time_s),
+        math.remainder(0.3 * math.sin(0.1 * time_s) + 0.05 * time_s, math.tau),
+        1.3,
+    ])  # fmt: skip
+
+
+def path_velocity(time_s: float) -> Floats:
+    step = 1e-4
+    change = path(time_s + step) - path(time_s - step)
+    change[3] = math.remainder(change[3], math.tau)
+    return change / (2 * step)
+
+
+def fly_path(pattern: Pattern | None, seconds: int, seed: int = 1) -> Track:
+    """As `agents.localization.lidar` does, without processes and at once."""
+    lidar, error = Lidar(), EstimateError(NOISE, seed, 1, TICK_S)
+    caster = ray_caster(load_scene(SCENE, relative_to=Path(), cache=scene_cache()).triangles)
+    scans = ScanRegistration(lidar)
+    located = PoseFilter(0, path(0.0)[:4], MAP_SD_M, MAP_SD_RAD, 0.05)
+    errors, yaws, told, spent = [], [], [], []
+    refused, before = 0, path_velocity(0.0)
+    for tick in range(1, round(seconds / TICK_S) + 1):
+        error.step()
+        time_s = tick * TICK_S
+        truth, velocity = path(time_s), error.velocity(path_velocity(time_s))
+        located.advance(tick, (velocity + before)[:4] / 2, TICK_S)
+        before = velocity
+        pose, deviation_m = error.pose(truth), error.deviations[0]
+        if pattern is not None:
+            if tick % SCAN_TICKS == 0:
+                generator = np.random.default_rng([seed, tick])
+                points = measure(caster, pattern(generator, lidar), truth, lidar, generator)
+                began_s = time.thread_time()
+                result = scans.register(points, located.pose)
+                taken = result.fits and located.correct(tick, result.pose, result.covariance)
+                if taken:
+                    scans.keep(located.pose)
+                spent.append(time.thread_time() - began_s)
+                refused += not taken
+            pose, deviation_m = located.pose, math.hypot(largest_deviation(located.covariance[:3, :3]), MAP_SD_M)
+        errors.append(math.dist(pose[:3], truth[:3]))
+        yaws.append(abs(math.remainder(pose[3] - truth[3], math.tau)))
+        told.append(deviation_m)
+    off, sure = np.array(errors), np.array(told)
+    cost = 1e3 * np.array(spent or [0.0])
+    return Track(
+        off[-1], math.sqrt((off**2).mean()), off.max(), max(yaws), sure.mean(), float((off > SIGMAS * sure).mean()),
+        refused, cost.mean(), float(np.percentile(cost, 95)),
+    )  # fmt: skip
+
+
+# --- missions --------------------------------------------------------------------------------------------------------
+
+SOURCES: Mapping[str, tuple[Literal["vehicle", "lidar"], bool]] = {
+    "perfect pose": ("vehicle", False),
+    "vehicle's estimate with noise": ("vehicle", True),
+    "KISS-ICP fused": ("lidar", True),
+}
+
+
+def mission_of(source: Literal["vehicle", "lidar"], *, noisy: bool, seconds: int) -> Mission:
+    return Mission(
+        duration_s=seconds,
+        simulation=Simulation(scene=SCENE, estimate=NOISE if noisy else EstimateNoise()),
+        localization=Localization(source=source),
+        feedback=Feedback(method="none"),
+        recording=Recording(enabled=False, report=False),
+        drones=(Drone(id=1, start=(0.0, 1.0, 2.0, 0.0, 1.3)),),
+    )
+
+
+def fly_mission(folder: Path, mission: Mission) -> dict[str, Any]:
+    """Figures of a flight of the real agent, simulator and ground station, in one process and virtual time, and of the
+    map that is made of its keyframes afterwards; in so short a flight nothing would have jumped yet."""
+    figures = folder / "figures.json"
+    if not figures.exists():
+        folder.mkdir(parents=True)
+        scene = load_scene(SCENE, relative_to=Path(), cache=scene_cache())
+        write_truth(scene, mission, folder, cache=scene_cache())
+
+        async def main() -> None:
+            async with located(mission, folder, seed=1) as team:
+                team.photographer = Photographer(mission, Camera(scene, mission.camera.intrinsics()))
+                if mission.localization.source == "lidar":
+                    team.sensor = LidarSensor(scene, mission.lidar, mission.seed)
+                await team.until_over()
+                if team.failed():
+                    raise SystemExit("\n".join(team.failed()))
+                keyframes.extend(team.keyframes)
+
+        keyframes: list[Keyframe] = []
+        run(main())
+        mapper = Mapper(mission, VirtualField.of(mission.target), folder, NoKeyframes())
+        for keyframe in keyframes:
+            mapper.add([keyframe])
+        scores = mapper.finish().scores
+        assert scores is not None
+        told = json.loads((folder / "summary.json").read_text())
+        told |= {"f_score_visible": scores.visible.f, "f_score_objects": scores.objects.f}
+        told |= {"keyframes": len(keyframes), "keyframes_unlocated": mapper.unlocated}
+        figures.write_text(json.dumps(told))
+    content: dict[str, Any] = json.loads(figures.read_text())
+    return content
+
+
+# --- the page --------------------------------------------------------------------------------------------------------
+
+
+def cm(metres: float | None) -> str:
+    return "–" if metres is None else f"{100 * metres:.1f}"
+
+
+EXTREMES = "final / rms / max"
+
+
+def tables(folder: Path, mission_s: int) -> str:
+    lines = [
+        f"| poses from | s | error {EXTREMES}, cm | yaw max, ° | told, cm | beyond 3 told | refused | CPU ms (p95) |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for seconds in SECONDS:
+        for name, pattern in SENSORS.items():
+            file = folder / f"track-{name.replace(' ', '-')}-{seconds}.json"
+            if not file.exists():
+                file.write_text(json.dumps(asdict(fly_path(pattern, seconds))))
+            track = Track(**json.loads(file.read_text()))
+            cost = f"{track.scan_ms:.0f} ({track.scan_p95_ms:.0f})" if pattern else "–"
+            lines.append(
+                f"| {name} | {seconds} | {cm(track.final_m)} / {cm(track.rms_m)} / {cm(track.max_m)}"
+                f" | {math.degrees(track.yaw_max_rad):.2f} | {cm(track.told_m)} | {track.beyond:.1%}"
+                f" | {track.refused} | {cost} |"
+            )
+    lines += [
+        "",
+        f"| mission of {mission_s} s | F visible | F objects | keyframes | left out | error rms / max, cm |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name, (source, noisy) in SOURCES.items():
+        place = folder / f"mission-{source}-{'noisy' if noisy else 'perfect'}-{mission_s}"
+        flown = fly_mission(place, mission_of(source, noisy=noisy, seconds=mission_s))
+        lines.append(
+            f"| {name} | {flown['f_score_visible']:.3f} | {flown['f_score_objects']:.3f} | {flown['keyframes']}"
+            f" | {flown['keyframes_unlocated']} | {cm(flown['pose_error_rms_m'])} / {cm(flown['pose_error_max_m'])} |"
+        )
+    return "\n".join(lines)
+
+
+def main(arguments: list[str]) -> None:
+    folder = Path(arguments[0])
+    folder.mkdir(parents=True, exist_ok=True)
+    measured = tables(folder, int(arguments[1]) if len(arguments) > 1 else SECONDS[0])
+    before, _, rest = PAGE.read_text().partition(BEGIN)
+    _, _, after = rest.partition(END)
+    PAGE.write_text(f"{before}{BEGIN}\n{measured}\n{END}{after}")
+    print(measured)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
