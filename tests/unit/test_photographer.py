@@ -12,7 +12,7 @@ from protocol.messages import Keyframe
 from protocol.mission import Camera as CameraSettings
 from protocol.mission import Drone, Mission, Simulation
 from sim_bridge.camera import Camera
-from sim_bridge.photographer import Photographer, Shot
+from sim_bridge.photographer import Photographer, Shot, Sight
 from sim_bridge.scenes.scene import pack_scene
 from sim_bridge.scenes.surfaces import Material, join, quad
 
@@ -33,7 +33,7 @@ def photographer(noise_m: float = 0.0, noise_rad: float = 0.0, seed: int = 1) ->
 
 
 def take(taker: Photographer, sequence: int = 0, drone: int = 1) -> Keyframe:
-    return taker.take(Shot(drone, sequence, tick=5 * sequence, pose=POSE))
+    return taker.take(Shot(Sight(drone, 5 * sequence, POSE, POSE), sequence))
 
 
 def errors(keyframe: Keyframe) -> Floats:
