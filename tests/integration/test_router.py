@@ -184,7 +184,11 @@ async def test_a_narrow_link_passes_no_more_than_its_width() -> None:
         passed, began = way.passed_bytes, clock()
         for number in range(10_000, 10_400):
             speaker.put(topics.HEAD, head(number))
-        assert await listener.until(lambda: heard[-1] == 10_399, PATIENCE_S)
+        for _ in range(int(PATIENCE_S)):  # a link as full as this one may drop any of them, the last as well
+            speaker.put(topics.HEAD, head(10_400))
+            if await listener.until(lambda: heard[-1] == 10_400, 1.0):
+                break
+        assert heard[-1] == 10_400
         took_s = clock() - began
 
     assert (way.passed_bytes - passed) / took_s < 21e3
