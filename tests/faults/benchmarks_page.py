@@ -57,6 +57,7 @@ SECTIONS: Mapping[str, Sequence[Entry]] = {
         Entry("feedback_grid", "an update of the grid method", 20),
         Entry("feedback_m3c2", "an update of M3C2, where a part of the map has changed", 5),
         Entry("feedback_m3c2_*", "the same, measured otherwise"),
+        Entry("pose_refinement", "mending a keyframe's pose, against its depth and fusion"),
         Entry("keyframes_full_4", "keyframes that come into the map while four drones fly in lockstep", 1),
     ),
     "Missions in lockstep": (
