@@ -71,6 +71,39 @@ start_patience_s = {patience}
 digest_period_s = 0.5
 checkpoint_period_s = 2.0
 """
+LOCKSTEP_MISSION = """
+name = "small"
+duration_s = 8.0
+[target]
+lower_m = [-1.0, -1.0, 0.0]
+upper_m = [1.0, 1.0, 0.6]
+[flight]
+lower_m = [-2.0, -2.0, 0.5]
+upper_m = [2.0, 2.0, 2.5]
+[controller]
+coverage_rate_per_s = 0.2
+[feedback]
+threshold = 1.0
+period_s = 1.0
+delay_s = 0.5
+[camera]
+width_px = 160
+height_px = 90
+[reconstruction]
+sweep_width_px = 80
+depth_planes = 32
+[recording]
+report = false
+[simulation]
+scene = "{scene}"
+[[drones]]
+id = 1
+start = [-0.8, 0.0, 1.4, 0.0, 1.3]
+[[drones]]
+id = 3
+start = [0.8, 0.0, 1.4, 3.0, 1.3]
+"""
+"""Two drones, eight seconds as fast as it goes; ``{scene}`` is a path."""
 PACE = {1: (0.2, 3.0), 2: (0.1, 1.5), 4: (0.05, 0.8)}
 """By team size: wished coverage rate and decay, 1/s, with which a flight takes about 40 s."""
 STOP_BELOW = 0.12

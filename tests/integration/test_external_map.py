@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import trimesh
 
-from faults.processes import write_scene
+from faults.processes import LOCKSTEP_MISSION, write_scene
 
 pytestmark = pytest.mark.processes
 
@@ -37,38 +37,6 @@ class Mortal(PlaneSweepMap):
 sys.exit(run_map_process(Mortal))
 """
 """The example, which is killed while its fourth map is waited for."""
-MISSION = """
-name = "small"
-duration_s = 8.0
-[target]
-lower_m = [-1.0, -1.0, 0.0]
-upper_m = [1.0, 1.0, 0.6]
-[flight]
-lower_m = [-2.0, -2.0, 0.5]
-upper_m = [2.0, 2.0, 2.5]
-[controller]
-coverage_rate_per_s = 0.2
-[feedback]
-threshold = 1.0
-period_s = 1.0
-delay_s = 0.5
-[camera]
-width_px = 160
-height_px = 90
-[reconstruction]
-sweep_width_px = 80
-depth_planes = 32
-[recording]
-report = false
-[simulation]
-scene = "{scene}"
-[[drones]]
-id = 1
-start = [-0.8, 0.0, 1.4, 0.0, 1.3]
-[[drones]]
-id = 3
-start = [0.8, 0.0, 1.4, 3.0, 1.3]
-"""
 
 
 @dataclass(frozen=True)
@@ -85,7 +53,7 @@ class Flight:
 
 def fly(folder: Path, program: str) -> Flight:
     mission = folder / "small.toml"
-    mission.write_text(MISSION.format(scene=write_scene(folder)))
+    mission.write_text(LOCKSTEP_MISSION.format(scene=write_scene(folder)))
     arguments = ("--headless", "--mapper", f"{sys.executable} {program}", "--out", folder / "runs")
     done = subprocess.run(
         [COVRECON, "run", mission, *arguments], capture_output=True, text=True, timeout=LIMIT_S, check=False

@@ -10,46 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from faults.processes import write_scene
+from faults.processes import LOCKSTEP_MISSION, write_scene
 
 pytestmark = pytest.mark.processes
 
 COVRECON = Path(sys.executable).with_name("covrecon")
 LIMIT_S = 150
 """For one command on a busy machine, compiling included."""
-
-MISSION = """
-name = "small"
-duration_s = 8.0
-[target]
-lower_m = [-1.0, -1.0, 0.0]
-upper_m = [1.0, 1.0, 0.6]
-[flight]
-lower_m = [-2.0, -2.0, 0.5]
-upper_m = [2.0, 2.0, 2.5]
-[controller]
-coverage_rate_per_s = 0.2
-[feedback]
-threshold = 1.0
-period_s = 1.0
-delay_s = 0.5
-[camera]
-width_px = 160
-height_px = 90
-[reconstruction]
-sweep_width_px = 80
-depth_planes = 32
-[recording]
-report = false
-[simulation]
-scene = "{scene}"
-[[drones]]
-id = 1
-start = [-0.8, 0.0, 1.4, 0.0, 1.3]
-[[drones]]
-id = 3
-start = [0.8, 0.0, 1.4, 3.0, 1.3]
-"""
 
 
 @dataclass(frozen=True)
@@ -65,7 +32,7 @@ def covrecon(*arguments: str | Path) -> tuple[int, str]:
 
 def fly(folder: Path, speed: str) -> Flight:
     mission = folder / "small.toml"
-    mission.write_text(MISSION.format(scene=write_scene(folder)))
+    mission.write_text(LOCKSTEP_MISSION.format(scene=write_scene(folder)))
     code, output = covrecon("run", mission, "--headless", "--speed", speed, "--out", folder / "runs")
     assert code == 0, output
     run = (folder / "runs" / "latest").resolve()
