@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Final, get_args
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from ground_station.reconstruction.depth_check import COMPARED_MIN, NEAREST_M, Measured, fault_of
 from ground_station.reconstruction.depth_range import depth_range
 from ground_station.reconstruction.fusion import Volume
-from ground_station.reconstruction.reconstructor import Keyframe, Mesh, Outcome, Refusal, State, Statistics
+from ground_station.reconstruction.ledger import Ledger
+from ground_station.reconstruction.reconstructor import Keyframe, Mesh, Outcome, State, Statistics
 from ground_station.reconstruction.source_views import ViewIndex
 from ground_station.reconstruction.surface_nets import extract_mesh
 from ground_station.reconstruction.views import View, shrink, to_grey
@@ -64,9 +65,7 @@ class DepthReconstructor:
         self._taken: Counter[int] = Counter()
         self._newest: dict[int, int] = {}  # tick
         self._newest_depth: dict[int, NDArray[np.float32]] = {}
-        self._received = 0
-        self._fused = 0
-        self._refused: Counter[Refusal] = Counter()
+        self._ledger = Ledger()
 
     def add(self, keyframes: Sequence[Keyframe]) -> tuple[Outcome, ...]:
         outcomes = [self._admit(keyframe) for keyframe in keyframes]
@@ -80,13 +79,7 @@ class DepthReconstructor:
 
     def statistics(self) -> Statistics:
         kept = sum(BYTES_PER_PIXEL * entry.measured.depth.size for entry in self._kept if entry)
-        return Statistics(
-            received=self._received,
-            fused=self._fused,
-            waiting=len(self._waiting),
-            refused=dict(self._refused),
-            memory_bytes=self._volume.size_bytes + kept,
-        )
+        return self._ledger.statistics(self._volume.size_bytes + kept)
 
     @property
     def lookback(self) -> int:
@@ -97,8 +90,7 @@ class DepthReconstructor:
             **self._volume.state(),
             "waiting": np.array([(entry.drone, entry.tick) for entry in self._waiting], np.int64).reshape(-1, 2),
             "newest": np.array(sorted(self._newest.items()), np.int64).reshape(-1, 2),
-            "fused": np.array(self._fused),
-            "refused": np.array([self._refused[reason] for reason in get_args(Refusal)]),
+            **self._ledger.state(),
         }
 
     def restore(self, state: State, recent: Iterable[Keyframe]) -> None:
@@ -108,28 +100,26 @@ class DepthReconstructor:
         waiting = set(map(tuple, state["waiting"].tolist()))
         self._waiting = [entry for entry in self._waiting if (entry.drone, entry.tick) in waiting]
         self._newest.update(state["newest"].tolist())
-        self._fused = int(state["fused"])
-        self._refused = +Counter(dict(zip(get_args(Refusal), state["refused"].tolist(), strict=True)))  # without zeros
-        self._received = self._fused + self._refused.total() + len(self._waiting)
+        self._ledger.restore(state, waiting=len(self._waiting))
 
     def _admit(self, keyframe: Keyframe) -> Outcome:
         """Keep a keyframe until others can confirm it, unless it is of no use."""
-        self._received += 1
+        self._ledger.received += 1
         if keyframe.depth is None:
-            return self._refuse(keyframe, "no_depth")
+            return self._ledger.refuse(keyframe, "no_depth")
         depth = np.where(keyframe.depth < NEAREST_M, np.float32(0), keyframe.depth)
         last = self._newest_depth.get(keyframe.drone)
         if keyframe.tick <= self._newest.get(keyframe.drone, -1) or (last is not None and np.array_equal(depth, last)):
-            return self._refuse(keyframe, "repeated")
+            return self._ledger.refuse(keyframe, "repeated")
         height, width = depth.shape
         if np.count_nonzero(depth) < COMPARED_MIN * depth.size:
-            return self._refuse(keyframe, "no_depth")
+            return self._ledger.refuse(keyframe, "no_depth")
         color = shrink(keyframe.image, width, height)
         camera = keyframe.intrinsics.scaled_to(width, height)
         view = View(to_grey(color), keyframe.position, keyframe.rotation, camera)
         measured = Measured(view, depth)
         if not self._shows_the_box(measured):
-            return self._refuse(keyframe, "off_target")
+            return self._ledger.refuse(keyframe, "off_target")
         typical = float(np.median(depth[depth > 0]))
         rank = self._taken[keyframe.drone]
         entry = _Entry(keyframe.drone, keyframe.sequence, keyframe.tick, rank, measured, color, typical)
@@ -165,12 +155,7 @@ class DepthReconstructor:
         slots = self._index.sources(view, entry.typical, self._settings.sources)
         fault = fault_of(entry.measured, [other.measured for slot in slots if (other := self._kept[slot]) is not None])
         if fault is not None:
-            return self._refuse(entry, fault)
+            return self._ledger.refuse(entry, fault)
         weight = np.maximum(depth, np.float32(self._settings.nearest_m)) ** np.float32(-2)
         self._volume.integrate(view, depth, weight, entry.color)
-        self._fused += 1
-        return Outcome(entry.drone, entry.sequence, "fused")
-
-    def _refuse(self, keyframe: Keyframe | _Entry, reason: Refusal) -> Outcome:
-        self._refused[reason] += 1
-        return Outcome(keyframe.drone, keyframe.sequence, "refused", reason)
+        return self._ledger.fuse(entry)

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Final, get_args
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,9 @@ from ground_station.reconstruction.consistency import agreements
 from ground_station.reconstruction.depth_map import DepthEstimator, DepthMap
 from ground_station.reconstruction.depth_range import DepthRange
 from ground_station.reconstruction.fusion import Volume
+from ground_station.reconstruction.ledger import Ledger
 from ground_station.reconstruction.pose_refiner import Pose, PoseRefiner
-from ground_station.reconstruction.reconstructor import Keyframe, Mesh, Outcome, Refusal, State, Statistics
+from ground_station.reconstruction.reconstructor import Keyframe, Mesh, Outcome, State, Statistics
 from ground_station.reconstruction.source_views import ViewIndex
 from ground_station.reconstruction.surface_nets import extract_mesh
 from ground_station.reconstruction.views import View, shrink, to_grey
@@ -88,24 +89,21 @@ class PlaneSweepReconstructor:
         self._unswept: list[_Entry] = []
         self._unfused: list[tuple[_Entry, Future[DepthMap]]] = []
         self._due: list[tuple[_Entry, Future[DepthMap]]] = []
-        self._decided: list[Outcome] = []
         self._taken: Counter[int] = Counter()
         self._admission = Admission(mission)
-        self._received = 0
-        self._fused = 0
-        self._refused: Counter[Refusal] = Counter()
+        self._ledger = Ledger()
 
     def add(self, keyframes: Sequence[Keyframe]) -> tuple[Outcome, ...]:
         self._fuse_due()  # depth maps begun by the call before, computed while the caller was away
         outcomes = [self._admit(keyframe) for keyframe in keyframes]
         self._schedule()
-        return (*outcomes, *self._take_decided())
+        return (*outcomes, *self._ledger.take())
 
     def flush(self) -> tuple[Outcome, ...]:
         self._fuse_due()
         self._schedule(everything=True)
         self._fuse_due()
-        return self._take_decided()
+        return self._ledger.take()
 
     def mesh(self) -> Mesh:
         self._fuse_due()
@@ -113,12 +111,8 @@ class PlaneSweepReconstructor:
 
     def statistics(self) -> Statistics:
         kept = len(self._index) * self._width * self._height * BYTES_PER_PIXEL
-        return Statistics(
-            received=self._received,
-            fused=self._fused,
-            waiting=self._received - self._fused - self._refused.total(),
-            refused=dict(self._refused),
-            memory_bytes=self._volume.size_bytes + kept + (self._refiner.size_bytes if self._refiner else 0),
+        return self._ledger.statistics(
+            self._volume.size_bytes + kept + (self._refiner.size_bytes if self._refiner else 0)
         )
 
     @property
@@ -133,8 +127,7 @@ class PlaneSweepReconstructor:
             **(self._refiner.state() if self._refiner else {}),
             "waiting": np.array([(entry.drone, entry.tick) for entry in waiting], np.int64).reshape(-1, 2),
             "newest": self._admission.state(),
-            "fused": np.array(self._fused),
-            "refused": np.array([self._refused[reason] for reason in get_args(Refusal)]),
+            **self._ledger.state(),
         }
 
     def restore(self, state: State, recent: Iterable[Keyframe]) -> None:
@@ -151,22 +144,20 @@ class PlaneSweepReconstructor:
                 self._sweep(entry)
                 entry.sources = ()
         self._admission.restore(state["newest"])
-        self._fused = int(state["fused"])
-        self._refused = +Counter(dict(zip(get_args(Refusal), state["refused"].tolist(), strict=True)))  # without zeros
-        self._received = self._fused + self._refused.total() + len(self._unswept)
+        self._ledger.restore(state, waiting=len(self._unswept))
 
     def _admit(self, keyframe: Keyframe, known: bool = False) -> Outcome:
         """Keep what later steps need of a keyframe, unless it is of no use; ``known`` from before a restart."""
-        self._received += 1
+        self._ledger.received += 1
         color = shrink(keyframe.image, self._width, self._height)
         camera = keyframe.intrinsics.scaled_to(self._width, self._height)
         view = View(to_grey(color), keyframe.position, keyframe.rotation, camera)
         span = self._admission.examine(keyframe, view)
         if isinstance(span, str):
-            return self._refuse(keyframe, span)
+            return self._ledger.refuse(keyframe, span)
         ticket = self._refine(keyframe, span, known)
         if ticket is None:
-            return self._refuse(keyframe, "pose")
+            return self._ledger.refuse(keyframe, "pose")
         view = self._mended(view, ticket)
         rank = self._taken[keyframe.drone]
         entry = _Entry(keyframe.drone, keyframe.sequence, keyframe.tick, rank, ticket, view, color, span)
@@ -187,7 +178,7 @@ class PlaneSweepReconstructor:
             self._unswept.remove(entry)
             depth = self._sweep(entry)
             if depth is None:
-                self._decided.append(self._refuse(entry, "no_overlap"))
+                self._ledger.note(self._ledger.refuse(entry, "no_overlap"))
             else:
                 self._unfused.append((entry, depth))
         self._due += [swept for swept in self._unfused if is_due(swept[0], 2)]
@@ -234,23 +225,13 @@ class PlaneSweepReconstructor:
             entry.sources = ()  # else every keyframe would keep all before it alive
             confirmed = agreements(entry.view, found.depth, others) >= AGREEMENTS_MIN
             if not confirmed.any() or np.count_nonzero(confirmed) < CONFIRMED_MIN * np.count_nonzero(found.depth):
-                self._decided.append(self._refuse(entry, "no_depth"))
+                self._ledger.note(self._ledger.refuse(entry, "no_depth"))
                 continue
             depth = np.where(confirmed, found.depth, np.float32(0))
             weight = found.score / np.maximum(found.depth, np.float32(self._settings.nearest_m)) ** 2
             self._volume.integrate(entry.view, depth, weight, entry.color)
-            self._fused += 1
-            self._decided.append(Outcome(entry.drone, entry.sequence, "fused"))
+            self._ledger.note(self._ledger.fuse(entry))
         self._due.clear()
-
-    def _refuse(self, keyframe: Keyframe | _Entry, reason: Refusal) -> Outcome:
-        self._refused[reason] += 1
-        return Outcome(keyframe.drone, keyframe.sequence, "refused", reason)
-
-    def _take_decided(self) -> tuple[Outcome, ...]:
-        decided = tuple(self._decided)
-        self._decided.clear()
-        return decided
 
 
 def _make_refiner(mission: Mission) -> PoseRefiner | None:

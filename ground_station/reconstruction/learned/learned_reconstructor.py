@@ -6,11 +6,11 @@ what the network says of it is averaged into the map. What is done when depends 
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, get_args
+from typing import Final
 
 import numpy as np
 
@@ -29,7 +29,8 @@ from ground_station.reconstruction.learned.fragment import (
 )
 from ground_station.reconstruction.learned.prediction import Photograph, Predictor
 from ground_station.reconstruction.learned.weights import SHIPPED, load_network
-from ground_station.reconstruction.reconstructor import Keyframe, Mesh, Outcome, Refusal, State, Statistics
+from ground_station.reconstruction.ledger import Ledger
+from ground_station.reconstruction.reconstructor import Keyframe, Mesh, Outcome, State, Statistics
 from ground_station.reconstruction.surface_nets import extract_mesh
 from ground_station.reconstruction.views import View, shrink, to_grey
 from protocol.mission import Mission
@@ -71,10 +72,7 @@ class LearnedReconstructor:
         self._admission = Admission(mission)
         self._kept: deque[_Entry] = deque(maxlen=KEPT)
         self._waiting: dict[int, list[_Entry]] = {}
-        self._decided: list[Outcome] = []
-        self._received = 0
-        self._fused = 0
-        self._refused: Counter[Refusal] = Counter()
+        self._ledger = Ledger()
 
     def add(self, keyframes: Sequence[Keyframe]) -> tuple[Outcome, ...]:
         outcomes = []
@@ -86,23 +84,19 @@ class LearnedReconstructor:
         for drone, entries in sorted(self._waiting.items()):
             if entries and now - entries[0].tick >= self._patience:
                 self._reconstruct(drone)
-        return (*outcomes, *self._take_decided())
+        return (*outcomes, *self._ledger.take())
 
     def flush(self) -> tuple[Outcome, ...]:
         for drone in sorted(self._waiting):
             self._reconstruct(drone)
-        return self._take_decided()
+        return self._ledger.take()
 
     def mesh(self) -> Mesh:
         return extract_mesh(self._volume, WEIGHT_MIN)
 
     def statistics(self) -> Statistics:
-        return Statistics(
-            received=self._received,
-            fused=self._fused,
-            waiting=self._received - self._fused - self._refused.total(),
-            refused=dict(self._refused),
-            memory_bytes=self._volume.size_bytes + sum(entry.photograph.size_bytes for entry in self._kept),
+        return self._ledger.statistics(
+            self._volume.size_bytes + sum(entry.photograph.size_bytes for entry in self._kept)
         )
 
     @property
@@ -115,8 +109,7 @@ class LearnedReconstructor:
             **self._volume.state(),
             "waiting": np.array(waiting, np.int64).reshape(-1, 2),
             "newest": self._admission.state(),
-            "fused": np.array(self._fused),
-            "refused": np.array([self._refused[reason] for reason in get_args(Refusal)]),
+            **self._ledger.state(),
         }
 
     def restore(self, state: State, recent: Iterable[Keyframe]) -> None:
@@ -127,19 +120,17 @@ class LearnedReconstructor:
         for drone, entries in self._waiting.items():
             self._waiting[drone] = [entry for entry in entries if (drone, entry.tick) in waiting]
         self._admission.restore(state["newest"])
-        self._fused = int(state["fused"])
-        self._refused = +Counter(dict(zip(get_args(Refusal), state["refused"].tolist(), strict=True)))  # without zeros
-        self._received = self._fused + self._refused.total() + sum(map(len, self._waiting.values()))
+        self._ledger.restore(state, waiting=sum(map(len, self._waiting.values())))
 
     def _admit(self, keyframe: Keyframe) -> Outcome:
         """Keep what later steps need of a keyframe, unless it is of no use."""
-        self._received += 1
+        self._ledger.received += 1
         color = shrink(keyframe.image, self._width, self._height)
         camera = keyframe.intrinsics.scaled_to(self._width, self._height)
         view = View(to_grey(color), keyframe.position, keyframe.rotation, camera)
         span = self._admission.examine(keyframe, view)
         if isinstance(span, str):
-            return self._refuse(keyframe, span)
+            return self._ledger.refuse(keyframe, span)
         photograph = self._predictor.look(shrink(keyframe.image, *self._size))
         entry = _Entry(keyframe.drone, keyframe.sequence, keyframe.tick, view, photograph)
         self._kept.append(entry)
@@ -155,7 +146,8 @@ class LearnedReconstructor:
         entries = [newest, *(entry for entry in reversed(self._kept) if entry is not newest)]
         fragment = [entries[place] for place in choose_views([entry.view for entry in entries], self._box)]
         if len(fragment) < VIEWS_MIN:
-            self._decided += [self._refuse(entry, "no_overlap") for entry in group]
+            for entry in group:
+                self._ledger.note(self._ledger.refuse(entry, "no_overlap"))
             return
         views = [entry.view for entry in fragment]
         window = place_window(middle_of(views, self._box), self._volume.origin, self._volume.distance.shape)
@@ -163,22 +155,11 @@ class LearnedReconstructor:
         projections = np.stack([projection(view) for view in views])
         block = self._predictor.predict([entry.photograph for entry in fragment], projections, corner, window)
         if not block.surface:
-            self._decided += [self._refuse(entry, "no_depth") for entry in group]
+            for entry in group:
+                self._ledger.note(self._ledger.refuse(entry, "no_depth"))
             return
         self._volume.blend(window.first, block.distance, block.weight, block.color)
         shown = shows([entry.view for entry in group], seen_points(newest.view, self._box))
         for entry, is_part in zip(group, shown.tolist(), strict=True):
-            if is_part or entry is newest:
-                self._fused += 1
-                self._decided.append(Outcome(entry.drone, entry.sequence, "fused"))
-            else:
-                self._decided.append(self._refuse(entry, "no_overlap"))
-
-    def _refuse(self, keyframe: Keyframe | _Entry, reason: Refusal) -> Outcome:
-        self._refused[reason] += 1
-        return Outcome(keyframe.drone, keyframe.sequence, "refused", reason)
-
-    def _take_decided(self) -> tuple[Outcome, ...]:
-        decided = tuple(self._decided)
-        self._decided.clear()
-        return decided
+            known = is_part or entry is newest
+            self._ledger.note(self._ledger.fuse(entry) if known else self._ledger.refuse(entry, "no_overlap"))
