@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import TypeAlias
 
-from protocol.free_space import start_fault
 from protocol.mission import Flight
 
 Point: TypeAlias = tuple[float, float, float]
@@ -35,11 +34,17 @@ def formation(flight: Flight, count: int, taken: Sequence[Point] = ()) -> list[S
         if len(starts) == count:
             break
         if all(math.dist(point, other) >= SPACING * flight.separation_m * (1 - 1e-9) for other in occupied):
-            if start_fault(flight, point):
+            if flight.has_zones and _may_not_start(flight, point):
                 continue
             occupied.append(point)
             starts.append((*point, 0.0, pitch))
     return starts
+
+
+def _may_not_start(flight: Flight, point: Point) -> bool:
+    from protocol.free_space import start_fault  # as in `protocol.mission`, for missions with zones alone
+
+    return bool(start_fault(flight, point))
 
 
 def _lattice(flight: Flight) -> Iterator[Point]:

@@ -13,7 +13,6 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from protocol.free_space import start_faults, zone_faults
 from protocol.geometry import Intrinsics
 from protocol.localization_settings import EstimateNoise, Lidar, Localization
 from protocol.operation_settings import Console, Metrics, Recording
@@ -117,6 +116,10 @@ class Flight(Box):
         return self.separation_m + 2 * self.position_error_m
 
     @property
+    def has_zones(self) -> bool:
+        return self.boundary is not None or bool(self.no_fly)
+
+    @property
     def velocity_limits(self) -> tuple[float, float, float, float, float]:
         """Largest x, y, z, yaw and pitch rate, m/s and rad/s."""
         return (self.speed_max_mps,) * 3 + (self.turn_rate_max_radps,) * 2
@@ -135,9 +138,12 @@ class Flight(Box):
 
     @model_validator(mode="after")
     def _zones_leave_room(self) -> Self:
-        faults = zone_faults(self)
-        if faults:
-            raise ValueError("\n".join(faults))
+        if self.has_zones:
+            from protocol.free_space import zone_faults  # numba and SciPy's images: 0.3 s for every process that starts
+
+            faults = zone_faults(self)
+            if faults:
+                raise ValueError("\n".join(faults))
         return self
 
     @model_validator(mode="after")
@@ -428,7 +434,10 @@ class Mission(Settings):
                         f"drones.{index}.start: {gap:.2f} m from drone {self.drones[other].id},"
                         f" less than flight.separation_m {self.flight.separation_m:g}"
                     )
-        faults += start_faults(self.flight, self.drones)
+        if self.flight.has_zones:
+            from protocol.free_space import start_faults
+
+            faults += start_faults(self.flight, self.drones)
         gain = self.controller.separation_gain_per_s * self.tick_s
         if gain > 0.5:
             faults.append(
