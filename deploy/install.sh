@@ -76,7 +76,8 @@ install_browser() {
 # Network namespaces, in which one machine stands for many; for root alone.
 install_hosts() { PATH=$PATH:/sbin:/usr/sbin command -v ip >/dev/null || install_wished iproute2 "many hosts"; }
 
-# Torch is for tests of the learned reconstructor, and comes only where it is found built for the CPU: 200 MB to fetch, 750 MB on disk.
+# Torch is for tests of the learned reconstructor, and comes only where it is found built for the CPU: 200 MB to fetch,
+# 750 MB on disk.
 install_torch() {
     local tool=(.venv/bin/python -m pip install --disable-pip-version-check) found
     if command -v uv >/dev/null; then
