@@ -18,7 +18,7 @@ from ground_station.reconstruction.depth_check import COMPARED_MIN, NEAREST_M, M
 from ground_station.reconstruction.depth_range import depth_range
 from ground_station.reconstruction.fusion import Volume
 from ground_station.reconstruction.ledger import Ledger
-from ground_station.reconstruction.reconstructor import Keyframe, Mesh, Outcome, State, Statistics
+from ground_station.reconstruction.reconstructor import PATIENCE_S, Keyframe, Mesh, Outcome, State, Statistics
 from ground_station.reconstruction.source_views import ViewIndex
 from ground_station.reconstruction.surface_nets import extract_mesh
 from ground_station.reconstruction.views import View, shrink, to_grey
@@ -26,8 +26,6 @@ from protocol.mission import Mission
 
 LOOK_AHEAD: Final = 1
 """Later keyframes of the same drone that a keyframe waits for."""
-PATIENCE_S: Final = 3.0
-"""Mission time after which a hovering drone's last keyframe is used without a later one."""
 VIEWS_KEPT: Final = 512
 """Newest keyframes that others may be compared with."""
 BYTES_PER_PIXEL: Final = 8

@@ -23,7 +23,7 @@ from ground_station.reconstruction.depth_range import DepthRange
 from ground_station.reconstruction.fusion import Volume
 from ground_station.reconstruction.ledger import Ledger
 from ground_station.reconstruction.pose_refiner import Pose, PoseRefiner
-from ground_station.reconstruction.reconstructor import Keyframe, Mesh, Outcome, State, Statistics
+from ground_station.reconstruction.reconstructor import PATIENCE_S, Keyframe, Mesh, Outcome, State, Statistics
 from ground_station.reconstruction.source_views import ViewIndex
 from ground_station.reconstruction.surface_nets import extract_mesh
 from ground_station.reconstruction.views import View, shrink, to_grey
@@ -33,8 +33,6 @@ LOOK_AHEAD: Final = 3
 """Later keyframes of the same drone that a keyframe waits for; 3 x 0.12 m is the widest useful baseline."""
 FEATURE_WIDTH: Final = 320
 """px: largest width of images in which poses are refined."""
-PATIENCE_S: Final = 3.0
-"""Mission time after which a hovering drone's last keyframes are used without later ones."""
 RESWEPT: Final = 4 * LOOK_AHEAD
 """Newest keyframes of each drone that get depth again after a restart: those that wait, and as many before them."""
 VIEWS_KEPT: Final = 512
@@ -77,8 +75,8 @@ class PlaneSweepReconstructor:
     def __init__(self, mission: Mission) -> None:
         settings = mission.reconstruction
         self._settings = settings
-        self._width = settings.sweep_width_px
-        self._height = round(settings.sweep_width_px * mission.camera.height_px / mission.camera.width_px)
+        sweep = mission.sweep_intrinsics()
+        self._width, self._height = sweep.width, sweep.height
         self._patience = round(PATIENCE_S / mission.tick_s)
         self._estimator = DepthEstimator(self._width, self._height, settings)
         self._pool = ThreadPoolExecutor(settings.workers, thread_name_prefix="depth")

@@ -20,6 +20,9 @@ from protocol.geometry import Floats, Intrinsics
 ROTATION_TOLERANCE: Final = 1e-4
 """Largest error of an entry of R R^T: float32 on the wire leaves 1e-6."""
 
+PATIENCE_S: Final = 3.0
+"""Mission time after which a hovering drone's last keyframes are used without later ones, by methods that wait."""
+
 Refusal: TypeAlias = Literal[
     "repeated", "featureless", "blurred", "off_target", "no_overlap", "no_depth", "wrong_scale", "unanswered", "pose"
 ]  # fmt: skip

@@ -30,15 +30,13 @@ from ground_station.reconstruction.learned.fragment import (
 from ground_station.reconstruction.learned.prediction import Photograph, Predictor
 from ground_station.reconstruction.learned.weights import SHIPPED, load_network
 from ground_station.reconstruction.ledger import Ledger
-from ground_station.reconstruction.reconstructor import Keyframe, Mesh, Outcome, State, Statistics
+from ground_station.reconstruction.reconstructor import PATIENCE_S, Keyframe, Mesh, Outcome, State, Statistics
 from ground_station.reconstruction.surface_nets import extract_mesh
 from ground_station.reconstruction.views import View, shrink, to_grey
 from protocol.mission import Mission
 
 GROUP: Final = 4
 """Keyframes of one drone from which a fragment is made: half a metre of its path, a fifth of what a window shows."""
-PATIENCE_S: Final = 3.0
-"""Mission time after which a hovering drone's last keyframes are used without later ones."""
 KEPT: Final = 128
 """Newest keyframes that a fragment is chosen from; with their features 85 MB."""
 WEIGHT_MIN: Final = 0.4
@@ -64,8 +62,8 @@ class LearnedReconstructor:
             load_network(Path(settings.learned.weights) if settings.learned.weights else SHIPPED)
         )
         self._box = mission.target
-        self._width = settings.sweep_width_px
-        self._height = round(settings.sweep_width_px * mission.camera.height_px / mission.camera.width_px)
+        sweep = mission.sweep_intrinsics()
+        self._width, self._height = sweep.width, sweep.height
         self._size = self._predictor.size(mission.camera.width_px, mission.camera.height_px)
         self._patience = round(PATIENCE_S / mission.tick_s)
         self._volume = Volume(mission.target, FINE_M, REACH_M)
