@@ -37,6 +37,11 @@ CODE: Final = (
     "ground_station/mapper.py",
 )
 """What a map and its figures depend on, weights included: maps are made again when it changes, and nothing is flown."""
+OWN: Final[Mapping[str, Sequence[str]]] = {
+    "learned": ("ground_station/reconstruction/learned",),
+    "depth": ("ground_station/reconstruction/depth_reconstructor.py",),
+}
+"""What no backend but the one of this name depends on: new weights cost the other maps nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,9 +78,10 @@ def room_jobs(wish: Wish, contrasts: Sequence[float]) -> list[Job]:
 def map_jobs(jobs: Sequence[Job], ways: Sequence[str], settings: Mapping[str, Any]) -> list[MapJob]:
     """Each way of making a map of each flight. Raises `MissionError` for a way that names no quality there is."""
     chosen = tuple(f"{name}={json.dumps(value)}" for name, value in settings.items() if name.startswith(TABLE))
-    code = _code_digest()
+    parts = {way: _parts(way) for way in ways}
+    keys = {way: _key(way, chosen, _code_digest(backend)) for way, (backend, _) in parts.items()}
     return [
-        MapJob(PlannedMap(flight=job.planned, way=way, key=_key(way, chosen, code)), *_parts(way), chosen)
+        MapJob(PlannedMap(flight=job.planned, way=way, key=keys[way]), *parts[way], chosen)
         for job in jobs
         for way in ways
     ]
@@ -94,9 +100,13 @@ def _key(way: str, settings: Sequence[str], code: str) -> str:
     return hashlib.sha256(told.encode()).hexdigest()
 
 
-def _code_digest() -> str:
+def _code_digest(backend: str) -> str:
+    """Of all code that a map of this backend depends on."""
+    others = [ROOT / name for owner, names in OWN.items() if owner != backend for name in names]
     digest = hashlib.sha256()
     for file in _sources():
+        if any(file.is_relative_to(other) for other in others):
+            continue
         digest.update(file.read_bytes())
     return digest.hexdigest()
 
