@@ -21,7 +21,9 @@ import numpy as np
 from prometheus_client import CollectorRegistry
 
 from agents.agent_metrics import AgentMetrics
+from agents.barriers import Neighbour, predicted_pose
 from agents.cameras.choice import make_feed
+from agents.energy import Reserve
 from agents.hearing import Hearing
 from agents.homing import Homecoming
 from agents.localization.choice import make_pose_source
@@ -29,6 +31,7 @@ from agents.orders import Orders
 from agents.planners.choice import make_planner
 from agents.planners.planner import Decision
 from agents.policies import Order
+from agents.swap import Swap
 from agents.team import Team
 from agents.vehicles.choice import make_vehicle
 from agents.vehicles.vehicle import Condition, Telemetry
@@ -106,6 +109,9 @@ class Agent:
         self._poses = make_pose_source(mission, drone, bus, lockstep=lockstep)
         self._orders = Orders(mission, self._clock.now_s, self._news.tell)
         self._operator = DroneOrder(drone=drone, action="fly", number=0)
+        self._reserve = Reserve(mission, drone)
+        self._swap = Swap(mission, drone, self._news.tell)
+        self._climb_m = 0.0
         self._feed = make_feed(mission, drone, bus, now_s=self._clock.now_s)
         self._watchdog = watchdog(
             self._vehicle.stop,
@@ -212,7 +218,11 @@ class Agent:
         telemetry = await self._poses.locate(tick.tick, self._vehicle.telemetry())
         condition = self._vehicle.condition()
         order = self._give_orders(telemetry, condition)
-        if condition.authority == "ready" and not self._finished and order.action == "wait":
+        if telemetry is not None and self._swap.is_done(telemetry, condition.authority, self._operator):
+            self._vehicle.make_ready()
+            self._homecoming = Homecoming(self._mission, self._drone, self._planner)
+        may_start = condition.authority == "ready" and not self._finished and order.action == "wait"
+        if may_start and self._way_up_is_free(telemetry, tick.tick):
             self._vehicle.take_off()  # the first tick is the order to start
         if telemetry is None or not self._is_sound(telemetry):
             self._step_blindly(telemetry, tick, order)
@@ -221,6 +231,7 @@ class Agent:
             self._news.tell("info", "vehicle", "telemetry is sound again")
             self._blind = False
         self.mode = mode = self._mode(condition, order)
+        self._climb_m = self._swap.climb_m(telemetry, condition.authority)
         self._publish(telemetry, tick.tick, mode)
         if self._feed is not None and condition.authority == "ours":
             self._feed.note_pose(telemetry.stamp_s, tick.tick, telemetry.pose, telemetry.rotation, telemetry.deviations)
@@ -260,7 +271,21 @@ class Agent:
 
     def _give_orders(self, telemetry: Telemetry | None, condition: Condition) -> Order:
         silence = None if self._lockstep else (self._ground_heard_s, self._now_s())
-        return self._orders.give(telemetry, condition, silence, self._finished, self._operator.action)
+        if condition.authority == "landed":
+            self._reserve.land()
+        elif condition.authority == "ours" and telemetry is not None and self._is_sound(telemetry):
+            self._reserve.look(telemetry)
+        order = self._orders.give(
+            telemetry, condition, silence, self._finished, self._operator.action, self._reserve.share
+        )
+        self._swap.note(order, stays=bool(self._finished) or self._operator.action in ("return", "land"))
+        return order
+
+    def _way_up_is_free(self, telemetry: Telemetry | None, tick: int) -> bool:
+        """At first all take off together, each at its place; later others may be about."""
+        if self._swap.count == 0:
+            return True
+        return telemetry is not None and self._swap.may_climb(telemetry, self._neighbours(telemetry, tick))
 
     def _publish(self, telemetry: Telemetry, tick: int, mode: Mode, blind_s: float = 0.0) -> None:
         state = self._state_of(telemetry, tick, mode, blind_s)
@@ -285,7 +310,7 @@ class Agent:
         return self._replication.terms()
 
     def _decide(self, telemetry: Telemetry, tick: Tick, mode: Mode, terms: SamplingTerms) -> Decision:
-        neighbours = self._team.neighbours(tick.tick, telemetry.delay_s, telemetry.position_sd_m)
+        neighbours = self._neighbours(telemetry, tick.tick)
         if mode in ("returning", "landing"):
             return self._homecoming.steer(
                 telemetry.pose, telemetry.velocity, neighbours, home=mode == "returning", now_s=self._clock.now_s()
@@ -299,13 +324,17 @@ class Agent:
             self._cells_at = tick.time_s
         return self._planner.decide(telemetry.pose, telemetry.velocity, neighbours, terms, self._cells)
 
+    def _neighbours(self, telemetry: Telemetry, tick: int) -> list[Neighbour]:
+        height_m = float(predicted_pose(telemetry.pose, telemetry.velocity, self._mission.flight)[2])
+        return self._team.neighbours(tick, telemetry.delay_s, telemetry.position_sd_m, height_m)
+
     def _mode(self, condition: Condition, order: Order) -> Mode:
         by_authority: dict[str, Mode] = {
             "ready": "starting",
             "starting": "starting",
             "yielded": "yielded",
             "landing": "landing",
-            "landed": "landed",
+            "landed": "starting" if self._swap.is_awaited else "landed",
             "lost": "yielded",
         }
         if condition.authority in by_authority:
@@ -342,6 +371,7 @@ class Agent:
             control=self._control,
             position_sd_m=telemetry.position_sd_m,
             angle_sd_rad=telemetry.angle_sd_rad,
+            climb_m=self._climb_m,
         )
 
     def _report(self, tick: int, decision: Decision, sent: Floats, solve_s: float, age_s: float) -> None:

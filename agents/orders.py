@@ -39,9 +39,11 @@ class Orders:
         ground_silent_s: tuple[float, float] | None,
         finished: str,
         operator: Wish,
+        reserve: float = 0.0,
     ) -> Order:
         """``ground_silent_s``: when the ground station was heard last, and now; None where its silence does not matter.
-        ``finished``: why the mission is over; empty while it is not. ``operator``: what one ordered last."""
+        ``finished``: why the mission is over; empty while it is not. ``operator``: what one ordered last. ``reserve``:
+        share of the battery that the way home takes."""
         now_s = self._now_s()
         if condition.authority != "starting":
             self._starting_since_s = now_s
@@ -55,6 +57,7 @@ class Orders:
             authority_reason=condition.reason,
             starting_s=now_s - self._starting_since_s,
             battery=1.0 if telemetry is None else telemetry.battery,
+            reserve=reserve,
             telemetry_age_s=math.inf if telemetry is None else self._telemetry_silence.look(telemetry.stamp_s, now_s),
             outside_m=0.0 if telemetry is None else outside_m(self._flight, telemetry.pose[:3].tolist()),
             jump_age_s=now_s - self._jumped_at_s,

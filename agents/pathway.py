@@ -28,7 +28,9 @@ class Leg:
     end: Floats
     """(3,) where to fly straight."""
     left_m: float
-    """Length of the way from here, with the descent at its end."""
+    """Length of the way from here, with the descent at its end ..."""
+    down_m: float = 0.0
+    """... which is so long."""
 
 
 class Pathway:
@@ -61,7 +63,8 @@ class Pathway:
         if not self._way:
             return None
         left = sum(math.dist(one, other) for one, other in pairwise([place, *self._way]))
-        return Leg(self._way[0], left + self._way[-1][2] - self._floor_m)
+        down = float(self._way[-1][2]) - self._floor_m
+        return Leg(self._way[0], left + down, down)
 
     def forget(self) -> None:
         """What comes next is another way."""

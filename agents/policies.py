@@ -41,7 +41,9 @@ class Situation:
     starting_s: float = 0.0
     """How long the authority has been "starting"; 0 if it is another."""
     battery: float = 1.0
-    """Share left."""
+    """Share left ..."""
+    reserve: float = 0.0
+    """... and that at which it just gets home (`agents.energy.Reserve.share`); 0 where nobody needs to know."""
     telemetry_age_s: float = 0.0
     outside_m: float = 0.0
     """Distance from the flight region (`outside_m`); 0 inside."""
@@ -192,6 +194,17 @@ POLICIES: tuple[Policy, ...] = (
         action=lambda _mission: "return",
         then="return to the start and land",
         reason=lambda now: f"battery at {now.battery:.0%}",
+        lasts=True,
+    ),
+    Policy(
+        "battery reserve",
+        "share left above `vehicles.battery_critical` at or below `vehicles.reserve_factor` times what the way home and"
+        " the landing take",
+        judged=_OURS,
+        holds=lambda _mission, now: now.battery <= now.reserve,
+        action=lambda _mission: "return",
+        then="return to the start and land",
+        reason=lambda now: f"battery at {now.battery:.0%}, the way home is kept {now.reserve:.0%}",
         lasts=True,
     ),
     Policy(

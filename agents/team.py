@@ -23,6 +23,8 @@ class _Seen:
     landed: bool = False
     """Then it stays where it is, also when its process has ended."""
     position_sd_m: float = 0.0
+    climb_m: float = 0.0
+    """So far up it is about to climb by itself, without giving way."""
 
 
 class Team:
@@ -40,16 +42,23 @@ class Team:
         if state.drone != self._own and (known is None or known.tick <= state.tick):
             tick = min(state.tick, now + 1)
             self._last_seen[state.drone] = _Seen(
-                tick, state.pose, state.velocity, state.blind_s, state.landed, state.position_sd_m
+                tick, state.pose, state.velocity, state.blind_s, state.landed, state.position_sd_m, state.climb_m
             )
 
-    def neighbours(self, tick: int, delay_s: float = 0.0, position_sd_m: float = 0.0) -> list[Neighbour]:
+    def neighbours(
+        self, tick: int, delay_s: float = 0.0, position_sd_m: float = 0.0, height_m: float = 0.0
+    ) -> list[Neighbour]:
         """All the others at ``tick``, ascending by id; the longer silent, the larger, and the longer ``delay_s``, the
-        time until a command is flown: until then either may move on. ``position_sd_m``: this drone's own."""
+        time until a command is flown: until then either may move on. ``position_sd_m``: this drone's own, and
+        ``height_m`` its predicted z: one that climbs by itself is everywhere on its way up, so where it is nearest."""
         others = sorted(self._last_seen.items())
         poses = np.array([seen.pose for _, seen in others]).reshape(-1, 5)
         velocities = np.array([seen.velocity for _, seen in others]).reshape(-1, 5)
         predicted = predicted_pose(poses, velocities, self._flight)
+        for row, (_, seen) in enumerate(others):
+            if seen.climb_m > 0:
+                low_m = predicted[row, 2]
+                predicted[row, 2] = min(max(height_m, low_m), max(low_m, seen.pose[2] + seen.climb_m))
         own_m = position_error(self._flight, position_sd_m) - 2 * self._flight.position_error_m
         return [
             Neighbour(

@@ -32,7 +32,9 @@ class CommandService:
     ) -> None:
         """``phase``: of the mission, now. ``changed``: called with what was commanded, in words, after it counts."""
         self._log, self._phase, self._changed = log, phase, changed
-        self._desk = CommandDesk([drone.id for drone in mission.drones])
+        vehicles = mission.vehicles
+        clears_swapped = vehicles.kind == "px4" and vehicles.battery_swap_s > 0 and vehicles.swapped == "on_command"
+        self._desk = CommandDesk([drone.id for drone in mission.drones], clears_swapped=clears_swapped)
         self._one_at_a_time = asyncio.Lock()
         self._refusals: dict[str, str] = {}
         self._said_again: Counter[str] = Counter()

@@ -72,7 +72,9 @@ def parse_command(parameters: Mapping[str, str]) -> tuple[str, Verb, tuple[int, 
 class CommandDesk:
     """All commands of one mission."""
 
-    def __init__(self, drones: Collection[int]) -> None:
+    def __init__(self, drones: Collection[int], *, clears_swapped: bool = False) -> None:
+        """``clears_swapped``: drones that stand on the ground with another battery wait for a "resume"."""
+        self._from = {**_FROM, "resume": _FROM["resume"] | {"fly"}} if clears_swapped else _FROM
         self._drones = tuple(sorted(drones))
         self._commands: dict[str, Command] = {}
         self._orders: dict[int, DroneOrder] = {}
@@ -102,7 +104,7 @@ class CommandDesk:
         if phase == "finished" and verb in ("pause", "resume", "abort"):
             return "the mission is over"
         wanted = drones or self._drones
-        if verb not in ("start", "abort") and not any(self._action(drone) in _FROM[verb] for drone in wanted):
+        if verb not in ("start", "abort") and not any(self._action(drone) in self._from[verb] for drone in wanted):
             return f"nothing to {verb}: {self._describe(wanted)}"
         # Drones may have heard of commands that this process has lost.
         newest = max([*(known.number for known in self._commands.values()), *self._acknowledged.values()], default=0)
@@ -116,7 +118,7 @@ class CommandDesk:
         if command.verb == "start":
             return
         for drone in command.drones:
-            if self._action(drone) in _FROM[command.verb]:
+            if self._action(drone) in self._from[command.verb]:
                 order = DroneOrder(drone=drone, action=_ACTIONS[command.verb], number=command.number)
                 self._orders[drone] = order
 

@@ -190,7 +190,8 @@ class GroundStation:
     def _take_in(self, step: Integrated) -> None:
         """Record a tick that is integrated, and do what is due at it."""
         self._recorder.phi(step.tick, self._replication.replica.field.phi)
-        self._record(step.tick, dict(zip(step.ids, step.poses.tolist(), strict=True)))
+        flown = dict(zip(step.ids, step.poses.tolist(), strict=True))
+        self._record(step.tick, flown | {drone: pose.tolist() for drone, pose in step.aground.items()})
         self._feedback.look(step.tick, self._replication.importance)
         self._reason = self._reason or self._end_of(step.tick)
 

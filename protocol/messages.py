@@ -24,9 +24,9 @@ Text = Annotated[str, Field(max_length=1000)]
 Outcome = Literal["solved", "infeasible", "out_of_time", "numerical", "none"]
 """What the solver said; anything but "solved" brakes. "none" before the first decision."""
 Mode = Literal["starting", "flying", "braking", "joining", "holding", "returning", "landing", "landed", "yielded"]
-"""starting: on the ground or taking off; joining: waits for phi; braking: the solver found no way; holding, returning
-and landing: by a policy, or because the mission is over; landed: stands on the ground and will stay there; yielded: a
-pilot or the autopilot itself flies."""
+"""starting: on the ground or taking off, also while a battery is changed; joining: waits for phi; braking: the solver
+found no way; holding, returning and landing: by a policy, or because the mission is over; landed: stands on the ground
+and will stay there; yielded: a pilot or the autopilot itself flies."""
 Phase = Literal["waiting", "starting", "flying", "finished"]
 """waiting: for an operator's start."""
 
@@ -65,6 +65,8 @@ class Tick(Message):
     """Jumps with a smaller sequence number are out; each takes effect at its own tick."""
     keyframes: Count
     """Keyframes sent before this tick."""
+    aground: tuple[DroneId, ...] = ()
+    """Drones that stand on the ground and will fly again: their states are waited for, but nothing is integrated."""
 
 
 class Setpoint(Message):
@@ -75,7 +77,9 @@ class Setpoint(Message):
     tick: TickNumber
     velocity: Vector5
     land: bool = False
-    """Come down here and stay, whatever is commanded later."""
+    """Come down here and stay, whatever is commanded later ..."""
+    take_off: bool = False
+    """... but for this: fly what is commanded again."""
 
 
 class Control(Message):
@@ -150,6 +154,8 @@ class DroneState(Message):
     """Of the position, along the direction in which it is largest: neighbours keep so much farther away ..."""
     angle_sd_rad: Deviation = 0.0
     """... and of the yaw and pitch."""
+    climb_m: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    """So far straight up its vehicle is about to climb by itself, without giving way."""
 
     @property
     def landed(self) -> bool:
@@ -181,6 +187,8 @@ class TeamStates(Message):
     """float64 (m, 5)"""
     position_sd_m: WireArray | None = None
     """float64 (n,), as in `DroneState`; None of a router that does not know them."""
+    climb_m: WireArray | None = None
+    """Likewise."""
 
 
 class Keyframe(Message):
@@ -326,7 +334,8 @@ class Event(Message):
     tick: TickNumber
     level: EventLevel
     kind: Annotated[str, Field(max_length=40)]
-    """What it is about: "mode", "order", "solver", "vehicle", "phi", "command", "link", "map", "disk"."""
+    """What it is about: "mode", "order", "solver", "vehicle", "battery", "phi", "command", "link", "map",
+    "disk"."""
     text: Text
 
 

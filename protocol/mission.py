@@ -13,6 +13,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from protocol.battery_settings import Battery, battery_faults
 from protocol.geometry import Intrinsics
 from protocol.localization_settings import EstimateNoise, Lidar, Localization
 from protocol.operation_settings import Console, Metrics, Recording
@@ -311,6 +312,7 @@ class Simulation(Settings):
     pose_noise_rad: NonNegative = 0.0
     """... and of its attitude. Independent from frame to frame; how the vehicles fly does not change."""
     estimate: EstimateNoise = EstimateNoise()
+    battery: Battery = Battery()
     start_patience_s: Positive = 120.0
     """How long the first tick waits for all drones; one that comes later joins in flight."""
 
@@ -468,6 +470,9 @@ class Mission(Settings):
             ]
         if self.localization.source == "lidar":
             faults += self._lidar_faults()
+        faults += battery_faults(self.simulation.battery, self.vehicles)
+        if self.vehicles.kind == "px4" or self.vehicles.battery_swap_s > 0:
+            faults += self._column_faults()
         faults += self.transport.faults()
         if self.reconstruction.nearest_m >= self.reconstruction.farthest_m:
             faults.append("reconstruction.nearest_m: must be less than farthest_m")
@@ -486,7 +491,7 @@ class Mission(Settings):
         return faults
 
     def _vehicle_faults(self) -> list[str]:
-        """Two agents on one vehicle, two vehicles that MAVSDK would take for one, or two that cannot land at home."""
+        """Two agents on one vehicle, or two vehicles that MAVSDK would take for one."""
         if not re.fullmatch(r"[a-z]+://[^:]*:\d+", self.vehicles.url):
             return [f"vehicles.url: {self.vehicles.url!r} is no connection with a port, like udpin://127.0.0.1:14540"]
         faults = []
@@ -498,13 +503,17 @@ class Mission(Settings):
                 faults.append(f"drones.{index}.url: {url} is drone {urls[url]}'s already")
             if system in systems:
                 faults.append(f"drones.{index}.system_id: {system} is drone {systems[system]}'s already")
-            for other in self.drones[:index]:
-                gap, room = math.dist(drone.start[:2], other.start[:2]), widened_separation(self.flight)
-                if gap < room:
-                    faults.append(
-                        f"drones.{index}.start: {gap:.2f} m beside drone {other.id}; to take off and land it takes"
-                        f" {room:.2f} m, flight.separation_m and what lag and position_error_m add"
-                    )
             urls.setdefault(url, drone.id)
             systems.setdefault(system, drone.id)
         return faults
+
+    def _column_faults(self) -> list[str]:
+        """Vehicles that climb and land by themselves do so straight up and down."""
+        room = widened_separation(self.flight)
+        return [
+            f"drones.{index}.start: {gap:.2f} m beside drone {other.id}; to take off and land it takes"
+            f" {room:.2f} m, flight.separation_m and what lag and position_error_m add"
+            for index, drone in enumerate(self.drones)
+            for other in self.drones[:index]
+            if (gap := math.dist(drone.start[:2], other.start[:2])) < room
+        ]

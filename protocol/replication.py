@@ -8,8 +8,8 @@ station's digests: it fetches the blocks that differ. One that starts late fetch
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
@@ -73,6 +73,8 @@ class Integrated:
     """(drones, 5)."""
     terms: SamplingTerms | None
     """Of this process's own drone, when it is among them."""
+    aground: Mapping[int, Floats] = field(default_factory=dict)
+    """Poses (5,) of those who stood on the ground and will fly again."""
 
 
 class Replication:
@@ -86,6 +88,7 @@ class Replication:
         self._digest_ticks = max(1, round(mission.replication.digest_period_s / mission.tick_s))
         self._lives: dict[int, tuple[int, ...]] = {}
         self._live: tuple[int, ...] = ()
+        self._aground: dict[int, tuple[int, ...]] = {}
         self._now = -1
         self._done = -1
         self._head_sequence = 0
@@ -115,6 +118,8 @@ class Replication:
         if self._now < 0:
             self._begin(tick.tick)
         self._lives[tick.tick] = tick.live
+        if tick.aground:
+            self._aground[tick.tick] = tick.aground
         if tick.tick >= self._now:
             self._now, self._live = tick.tick, tick.live
         if tick.lockstep:
@@ -203,7 +208,8 @@ class Replication:
         """Whether all that ``tick`` needs is in. ``gone``: roles that are not waited for."""
         if tick < self.replica.tick:
             return True
-        waited_for = [drone for drone in self._lives.get(tick, self._live) if f"drone/{drone}" not in gone]
+        told = (*self._lives.get(tick, self._live), *self._aground.get(tick, ()))
+        waited_for = [drone for drone in told if f"drone/{drone}" not in gone]
         return self.log.has_all(tick, waited_for) and (self._has_jumps(tick) or "ground" in gone)
 
     def _has_jumps(self, tick: int) -> bool:
@@ -235,13 +241,15 @@ class Replication:
         terms = self.replica.advance(tick, poses, self._mission.tick_s, row, jumps=not self._resequence)
         self.log.forget_before(tick)
         self._lives = {known: live for known, live in self._lives.items() if known > tick}
+        standing, places = self.log.poses_at(tick, self._aground.get(tick, ()))
+        self._aground = {known: aground for known, aground in self._aground.items() if known > tick}
         self._place_pages()
         if self.whole:
             self._sketch()
         for reached in [entry for entry in self._reached if entry[0] <= self.replica.tick]:
             self._reached.remove(reached)
             reached[1]()
-        return Integrated(tick, ids, poses, terms if row >= 0 else None)
+        return Integrated(tick, ids, poses, terms if row >= 0 else None, dict(zip(standing, places, strict=True)))
 
     def newest(self) -> tuple[int, Floats]:
         """Row of the own drone in the newest poses (drones, 5) of all live ones; its own state must have been heard."""

@@ -33,6 +33,7 @@ class Sighting:
     landed: bool
     earlier: Sequence[TimedPose]
     position_sd_m: float = 0.0
+    climb_m: float = 0.0
 
 
 def pack(states: Iterable[tuple[DroneState, Sequence[TimedPose]]]) -> TeamStates:
@@ -51,6 +52,7 @@ def pack(states: Iterable[tuple[DroneState, Sequence[TimedPose]]]) -> TeamStates
         earlier_ticks=np.array([tick for _, tick, _ in earlier], np.int32),
         earlier_poses=_five([pose for _, _, pose in earlier]),
         position_sd_m=np.array([state.position_sd_m for state in newest], np.float64),
+        climb_m=np.array([state.climb_m for state in newest], np.float64),
     )
 
 
@@ -62,6 +64,7 @@ def unpack(message: TeamStates) -> list[Sighting]:
     """
     count, repeated = message.drones.size, message.earlier_rows.size
     deviations = np.zeros(count) if message.position_sd_m is None else message.position_sd_m
+    climbs = np.zeros(count) if message.climb_m is None else message.climb_m
     for array, dtype, shape in (
         (message.drones, np.uint8, (count,)),
         (message.ticks, np.int32, (count,)),
@@ -73,6 +76,7 @@ def unpack(message: TeamStates) -> list[Sighting]:
         (message.earlier_ticks, np.int32, (repeated,)),
         (message.earlier_poses, np.float64, (repeated, 5)),
         (deviations, np.float64, (count,)),
+        (climbs, np.float64, (count,)),
     ):
         if array.dtype != dtype or array.shape != shape:
             raise MessageError(f"team_states: {array.dtype} of shape {array.shape} instead of {dtype.__name__} {shape}")
@@ -81,6 +85,7 @@ def unpack(message: TeamStates) -> list[Sighting]:
     _require(_within(message.ticks, 0, np.inf) and _within(message.earlier_ticks, 0, np.inf), "a tick before the first")
     _require(_within(message.blind_s, 0, BLIND_MAX_S), "a time without telemetry that is too long")
     _require(_within(deviations, 0, POSE_MAX), "a standard deviation that is none")
+    _require(_within(climbs, 0, POSE_MAX), "a climb that is none")
     for array in (message.poses, message.velocities, message.earlier_poses):
         _require(_within(array, -POSE_MAX, POSE_MAX), "a coordinate that is too large")
     earlier: list[list[TimedPose]] = [[] for _ in range(count)]
@@ -90,10 +95,11 @@ def unpack(message: TeamStates) -> list[Sighting]:
         earlier[row].append((tick, tuple(pose)))
     columns = (
         message.drones, message.ticks, message.poses, message.velocities, message.blind_s, message.landed, deviations,
+        climbs,
     )  # fmt: skip
     return [
-        Sighting(drone, tick, tuple(pose), tuple(velocity), blind_s, bool(landed), poses, deviation)
-        for drone, tick, pose, velocity, blind_s, landed, deviation, poses in zip(
+        Sighting(drone, tick, tuple(pose), tuple(velocity), blind_s, bool(landed), poses, deviation, climb)
+        for drone, tick, pose, velocity, blind_s, landed, deviation, climb, poses in zip(
             *(column.tolist() for column in columns), earlier, strict=True
         )
     ]

@@ -51,6 +51,19 @@ class Vehicles(Settings):
     """Share left from which a drone returns to its start and lands ..."""
     battery_critical: Share = 0.1
     """... and from which it lands where it is."""
+    reserve_factor: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 1.5
+    """A drone returns while what is left above ``battery_critical`` is this many times what its way home and the
+    landing take, at the use that it has measured ..."""
+    battery_full_s: Positive = 1200.0
+    """... and at least at that of a battery which lasts so long."""
+    battery_swap_s: NonNegative = 0.0
+    """How long a landed drone stands until a full battery is in; the simulated crew takes exactly so long. 0: nobody
+    swaps, it stays on the ground."""
+    battery_spares: Annotated[int, Field(ge=0)] | None = None
+    """Spare batteries of each drone: who has used them up stays on the ground. Left out: as many as it takes."""
+    swapped: Literal["on_command", "at_once"] = "on_command"
+    """Whether a drone with a fresh battery takes off when an operator says "resume", hands off, or by itself. The
+    simulated crew is quick: there it is always at once."""
     fence_margin_m: Positive = 0.5
     """Outside the flight region by so much, a drone lands."""
     jump_m: Positive = 0.5

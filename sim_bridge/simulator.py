@@ -23,6 +23,7 @@ from protocol.messages import Setpoint, Tick, VehicleSample
 from protocol.metrics_endpoint import MetricsEndpoint
 from protocol.mission import Mission
 from protocol.session import Link
+from sim_bridge.battery import VehicleBattery
 from sim_bridge.believed import BelievedPoses
 from sim_bridge.darkroom import Darkroom
 from sim_bridge.dynamics import VehicleBody
@@ -61,6 +62,11 @@ class Simulator:
         self._mission, self._bus, self._lockstep = mission, bus, lockstep
         self._darkroom = Darkroom(bus, photographer)
         self._bodies = {drone.id: VehicleBody.at(np.array(drone.start)) for drone in mission.drones}
+        vehicles = mission.vehicles
+        self._batteries = {
+            drone: VehicleBattery(mission.simulation.battery, vehicles.battery_swap_s, vehicles.battery_spares)
+            for drone in self._bodies
+        }
         self._scanner = Scanner(bus, lidar, mission.scan_ticks)
         noise = mission.simulation.estimate
         self._errors = {
@@ -88,9 +94,13 @@ class Simulator:
             return
         tick = min(setpoint.tick, self._tick)
         body.command(np.array(setpoint.velocity), tick * self._mission.tick_s, self._mission.flight)
-        body.landing = body.landing or setpoint.land
+        body.landing = (body.landing and not self._may_start(setpoint)) or setpoint.land
         self._flown[setpoint.drone] = tick
         self._silent.discard(setpoint.drone)
+
+    def _may_start(self, setpoint: Setpoint) -> bool:
+        """An empty battery carries nobody."""
+        return setpoint.take_off and self._batteries[setpoint.drone].share > 0
 
     async def run(self) -> None:
         """Until the ground station says that the mission is finished.
@@ -117,14 +127,22 @@ class Simulator:
                 else:
                     await asyncio.sleep(max(0.0, began + (self._tick + 1) * self._mission.tick_s - loop.time()))
                     self._require_ground(self._mission.replication.ground_patience_s + GROUND_PATIENCE_S)
-                for body in self._bodies.values():
+                for drone, body in self._bodies.items():
                     body.step(self._mission.tick_s, self._tick * self._mission.tick_s, self._mission.flight)
+                    self._use(drone, body)
                 for error in self._errors.values():
                     error.step()
                 self._tick += 1
         finally:
             self._darkroom.close()
             self._scanner.close()
+
+    def _use(self, drone: int, body: VehicleBody) -> None:
+        battery = self._batteries[drone]
+        battery.step(self._mission.tick_s, body.velocity, down=body.is_down)
+        if battery.share == 0 and not body.landing:
+            log.error("tick %d: drone %d: its battery is empty: it comes down here", self._tick, drone)
+            body.landing = True
 
     async def _photograph(self, poses: Mapping[int, Floats]) -> None:
         """What cameras see at ``poses`` (5,), posed where their drones believe to be."""
@@ -134,15 +152,23 @@ class Simulator:
             return
         if self._lockstep:
             tick = self._tick
-            await self._stand_still(lambda: believed.has(tick, self._live()), LOCKSTEP_PATIENCE_S)
+            await self._stand_still(lambda: believed.has(tick, [*self._live(), *self._aground()]), LOCKSTEP_PATIENCE_S)
         await self._darkroom.photograph_believed(believed.take(), wait=self._lockstep)
 
     def _live(self) -> list[int]:
         return [drone for drone in sorted(self._bodies) if self._is_live(drone)]
 
     def _is_live(self, drone: int) -> bool:
-        here = drone not in self._silent and f"drone/{drone}" in self._bus.alive
-        return here and not self._bodies[drone].is_down
+        return self._is_here(drone) and not self._bodies[drone].is_down
+
+    def _is_here(self, drone: int) -> bool:
+        return drone not in self._silent and f"drone/{drone}" in self._bus.alive
+
+    def _aground(self) -> list[int]:
+        """Those who stand on the ground, where a crew may make them fly again."""
+        if self._mission.vehicles.battery_swap_s == 0:
+            return []
+        return [drone for drone, body in sorted(self._bodies.items()) if body.is_down and self._is_here(drone)]
 
     def _beat(self) -> Tick:
         if not self._lockstep:
@@ -158,6 +184,7 @@ class Simulator:
             jump_epoch=self._watch.head.epoch,
             next_jump=self._watch.head.next_sequence,
             keyframes=self._darkroom.sent,
+            aground=tuple(self._aground()),
         )
 
     def _sample(self, drone: int, body: VehicleBody) -> VehicleSample:
@@ -165,7 +192,7 @@ class Simulator:
             drone=drone,
             pose=tuple(body.pose.tolist()),
             velocity=tuple(body.velocity.tolist()),
-            battery=1.0,
+            battery=self._batteries[drone].share,
             setpoint_tick=self._flown[drone],
         )
         if self._believed is None:
@@ -199,10 +226,13 @@ class Simulator:
         tick = self._tick
 
         def answered() -> bool:
-            return all(flown >= tick or not self._is_live(drone) for drone, flown in self._flown.items())
+            aground = self._aground()
+            return all(
+                flown >= tick or not (self._is_live(drone) or drone in aground) for drone, flown in self._flown.items()
+            )
 
         if not await self._stand_still(answered, LOCKSTEP_PATIENCE_S):
-            late = {drone for drone in self._live() if self._flown[drone] < tick}
+            late = {drone for drone in (*self._live(), *self._aground()) if self._flown[drone] < tick}
             log.error("tick %d: no answer from drones %s: going on without them", tick, sorted(late))
             self._silent |= late
         if self._live() or any(body.is_down for body in self._bodies.values()):

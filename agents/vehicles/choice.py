@@ -15,7 +15,8 @@ def make_vehicle(
 ) -> Vehicle:
     """``now_s``: the clock by which the agent judges silence; ``events`` takes a level and a text for people."""
     if mission.vehicles.kind == "simulated":
-        return SimulatedVehicle(bus, drone, mission.flight, mission.tick_s, now_s)
+        start_m = mission.drone(drone).start[2]
+        return SimulatedVehicle(bus, drone, mission.flight, mission.tick_s, now_s, start_m)
     from agents.vehicles.px4.vehicle import Px4Vehicle  # MAVSDK is not wanted in memory without an autopilot
 
     return Px4Vehicle(mission, drone, now_s=now_s, events=events)

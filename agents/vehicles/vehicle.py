@@ -10,7 +10,8 @@ from protocol.geometry import Floats
 Authority = Literal["ready", "starting", "ours", "yielded", "landing", "landed", "lost"]
 """Who flies, and how far it is. ready: on the ground, checks passed. starting: arming, taking off, until it obeys.
 ours: it flies what it is sent. yielded: a pilot or a failsafe of its own flies; nothing is sent. landing: it comes down
-by itself, told by us. landed: on the ground after it flew; it will not start again. lost: nothing is heard of it."""
+by itself, told by us. landed: on the ground after it flew; it will not start again, unless it is made ready. lost:
+nothing is heard of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +91,11 @@ class Vehicle(Protocol):
 
     def land(self) -> None:
         """Come down here and stay on the ground, whatever is sent later; may be called again."""
+        ...
+
+    def make_ready(self) -> None:
+        """It stands on the ground with another battery: from "landed" to "ready", as before its first take-off. Nothing
+        happens when it has not landed."""
         ...
 
     def leave(self, *, hold: bool) -> None:

@@ -149,6 +149,15 @@ class AuthorityLogic:
         self.phase, self._reason, self._refusal, self._landing_seen = "landing", "told to land", "", False
         self._tried = ("wait", -math.inf)
 
+    def make_ready(self, now_s: float) -> bool:
+        """Whether it is: it has landed, and is disarmed."""
+        seen = self._seen
+        if self.phase != "landed" or seen is None or not seen.on_ground or seen.armed:
+            return False
+        self._enter("ready", now_s, "")
+        self._land_ordered = self._landing_seen = self._climb_seen = self._flew = False
+        return True
+
     def answered(self, step: Step, now_s: float, refusal: str = "") -> None:
         """A command came back; ``refusal``: what the vehicle said, or that it said nothing."""
         again = step == self._tried[0]

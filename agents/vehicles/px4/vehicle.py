@@ -112,6 +112,10 @@ class Px4Vehicle:
         with self._lock:
             self._logic.take_off(self._now_s())
 
+    def make_ready(self) -> None:
+        with self._lock:
+            self._logic.make_ready(self._now_s())
+
     # What it says
 
     def condition(self) -> Condition:

@@ -1,0 +1,96 @@
+"""When a battery holds just enough for the way home: the share that must be left, from the real way and the use so far.
+
+The use is learned from the fall of the share that the vehicle tells, whatever carries it. PX4 tells whole per cent, and
+some batteries stay at 100 % for a while, so it is never taken for less than that of a battery which lasts for
+``vehicles.battery_full_s``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+
+from agents.homing import DESCENT_MPS
+from agents.pathway import Pathway
+from agents.vehicles.vehicle import Telemetry
+from protocol.mission import Mission
+
+WINDOW_S = 60.0
+"""The use is that of so long a flight ..."""
+LEARN_S = 10.0
+"""... and of no shorter one."""
+SAMPLE_S = 0.5
+"""Between two samples of the share, and two looks for the way home."""
+LAST_METRES_S = 6.0
+"""What the approach, the touchdown and the motors' stop take beyond the way at full speed: the last half metre to home
+is flown ever slower, and so is that to the ground."""
+STAGGER_MAX = 0.5
+"""Of their first battery, drones that swap give away so much at most not to do so all at once."""
+
+
+class Reserve:
+    """Of one drone."""
+
+    def __init__(self, mission: Mission, drone: int) -> None:
+        self._flight, self._vehicles = mission.flight, mission.vehicles
+        self._home = np.array(mission.drone(drone).start)
+        self._pathway = Pathway(mission.flight)
+        ids = sorted(other.id for other in mission.drones)
+        self._rank, self._last_rank = ids.index(drone), len(ids) - 1
+        self._samples: deque[tuple[float, float]] = deque()
+        self._fresh = True
+        """Whether it flies on its first battery."""
+        self.share = 0.0
+        """The share from which it must return; 0 while it does not fly, or its battery does not empty."""
+        self.home_s = 0.0
+        """How long the way home and the landing take from here."""
+
+    def look(self, telemetry: Telemetry) -> None:
+        """Every tick that the vehicle flies for us."""
+        now_s, left = telemetry.stamp_s, telemetry.battery
+        if self._samples and now_s - self._samples[-1][0] < SAMPLE_S:
+            return
+        self._samples.append((now_s, left))
+        while now_s - self._samples[0][0] > WINDOW_S:
+            self._samples.popleft()
+        if left >= 1.0:
+            return
+        self.home_s = self._home_s(telemetry)
+        critical, factor = self._vehicles.battery_critical, self._vehicles.reserve_factor
+        self.share = critical + factor * self.home_s * self.use_per_s + self._stagger()
+
+    def land(self) -> None:
+        """It stands on the ground: what comes next is another flight, with another battery."""
+        if self._samples:
+            self._fresh = False
+        self._samples.clear()
+        self._pathway.forget()
+        self.share = self.home_s = 0.0
+
+    @property
+    def use_per_s(self) -> float:
+        """Share that each second of flight takes."""
+        least = 1.0 / self._vehicles.battery_full_s
+        if not self._samples:
+            return least
+        (began_s, before), (now_s, left) = self._samples[0], self._samples[-1]
+        return max(least, (before - left) / (now_s - began_s)) if now_s - began_s >= LEARN_S else least
+
+    def _home_s(self, telemetry: Telemetry) -> float:
+        place, floor_m = telemetry.pose[:3], self._flight.lower_m[2]
+        leg = self._pathway.leg(place, self._home[:2])
+        level_m, down_m = math.dist(place[:2], self._home[:2]), max(0.0, float(place[2]) - floor_m)
+        if leg is not None:
+            level_m, down_m = leg.left_m - leg.down_m, leg.down_m
+        descent = min(DESCENT_MPS, self._flight.speed_max_mps)
+        return level_m / self._flight.speed_max_mps + (down_m + max(0.0, floor_m)) / descent + LAST_METRES_S
+
+    def _stagger(self) -> float:
+        """What keeps those who took off together from being away together: each goes home earlier than the one before,
+        by as long as a swap keeps it away, or by as much as the first battery gives."""
+        if self._vehicles.battery_swap_s == 0 or not self._fresh or self._rank == 0:
+            return 0.0
+        away = (self._vehicles.battery_swap_s + 2 * self.home_s) * self.use_per_s
+        return self._rank * min(away, STAGGER_MAX / self._last_rank)
