@@ -219,8 +219,7 @@ class Agent:
         condition = self._vehicle.condition()
         order = self._give_orders(telemetry, condition)
         if telemetry is not None and self._swap.is_done(telemetry, condition.authority, self._operator):
-            self._vehicle.make_ready()
-            self._homecoming = Homecoming(self._mission, self._drone, self._planner)
+            condition = self._fly_again(telemetry, condition)
         may_start = condition.authority == "ready" and not self._finished and order.action == "wait"
         if may_start and self._way_up_is_free(telemetry, tick.tick):
             self._vehicle.take_off()  # the first tick is the order to start
@@ -280,6 +279,14 @@ class Agent:
         )
         self._swap.note(order, stays=bool(self._finished) or self._operator.action in ("return", "land"))
         return order
+
+    def _fly_again(self, telemetry: Telemetry, condition: Condition) -> Condition:
+        """What the vehicle's condition is, now that it has another battery."""
+        if not self._vehicle.make_ready():
+            return condition
+        self._swap.renew(telemetry.stamp_s)
+        self._homecoming = Homecoming(self._mission, self._drone, self._planner)
+        return self._vehicle.condition()
 
     def _way_up_is_free(self, telemetry: Telemetry | None, tick: int) -> bool:
         """At first all take off together, each at its place; later others may be about."""

@@ -15,7 +15,7 @@ import numpy as np
 from agents.homing import DESCENT_MPS
 from agents.pathway import Pathway
 from agents.vehicles.vehicle import Telemetry
-from protocol.mission import Mission
+from protocol.mission import Flight, Mission
 
 WINDOW_S = 60.0
 """The use is that of so long a flight ..."""
@@ -23,11 +23,14 @@ LEARN_S = 10.0
 """... and of no shorter one."""
 SAMPLE_S = 0.5
 """Between two samples of the share, and two looks for the way home."""
-LAST_METRES_S = 6.0
-"""What the approach, the touchdown and the motors' stop take beyond the way at full speed: the last half metre to home
-is flown ever slower, and so is that to the ground."""
-STAGGER_MAX = 0.5
-"""Of their first battery, drones that swap give away so much at most not to do so all at once."""
+LAST_METRES_S = 2.0
+"""What the way takes beyond full speed: the last half metre to home is flown ever slower, and so is that to the
+ground. Measured: 1 to 2 s."""
+
+
+def landing_s(flight: Flight, height_m: float) -> float:
+    """How long it takes from ``height_m`` (world z) straight down, until the motors stop."""
+    return max(0.0, height_m) / min(DESCENT_MPS, flight.speed_max_mps) + LAST_METRES_S
 
 
 class Reserve:
@@ -38,7 +41,7 @@ class Reserve:
         self._home = np.array(mission.drone(drone).start)
         self._pathway = Pathway(mission.flight)
         ids = sorted(other.id for other in mission.drones)
-        self._rank, self._last_rank = ids.index(drone), len(ids) - 1
+        self._rank, self._team = ids.index(drone), len(ids)
         self._samples: deque[tuple[float, float]] = deque()
         self._fresh = True
         """Whether it flies on its first battery."""
@@ -59,7 +62,8 @@ class Reserve:
             return
         self.home_s = self._home_s(telemetry)
         critical, factor = self._vehicles.battery_critical, self._vehicles.reserve_factor
-        self.share = critical + factor * self.home_s * self.use_per_s + self._stagger()
+        needed = critical + factor * self.home_s * self.use_per_s
+        self.share = needed + self._stagger(1.0 - needed)
 
     def land(self) -> None:
         """It stands on the ground: what comes next is another flight, with another battery."""
@@ -84,13 +88,12 @@ class Reserve:
         level_m, down_m = math.dist(place[:2], self._home[:2]), max(0.0, float(place[2]) - floor_m)
         if leg is not None:
             level_m, down_m = leg.left_m - leg.down_m, leg.down_m
-        descent = min(DESCENT_MPS, self._flight.speed_max_mps)
-        return level_m / self._flight.speed_max_mps + (down_m + max(0.0, floor_m)) / descent + LAST_METRES_S
+        return level_m / self._flight.speed_max_mps + landing_s(self._flight, floor_m + down_m)
 
-    def _stagger(self) -> float:
-        """What keeps those who took off together from being away together: each goes home earlier than the one before,
-        by as long as a swap keeps it away, or by as much as the first battery gives."""
+    def _stagger(self, usable: float) -> float:
+        """What keeps those who took off together from being away together: with their first battery, each goes home
+        earlier than the one before, by as long as a swap keeps it away, or by its part of what is ``usable``."""
         if self._vehicles.battery_swap_s == 0 or not self._fresh or self._rank == 0:
             return 0.0
         away = (self._vehicles.battery_swap_s + 2 * self.home_s) * self.use_per_s
-        return self._rank * min(away, STAGGER_MAX / self._last_rank)
+        return self._rank * min(away, max(0.0, usable) / self._team)

@@ -87,12 +87,13 @@ class Swap:
         if not self._full_told:
             self._tell("info", "battery", f"another battery is in, at {telemetry.battery:.0%}")
             self._full_told = True
-        if not self._by_itself and (operator.number == number or operator.action != "fly"):
-            return False
-        self._cause, self._landed, self._full_told, self._ready_s = "", None, False, telemetry.stamp_s
+        return self._by_itself or (operator.number > number and operator.action == "fly")
+
+    def renew(self, now_s: float) -> None:
+        """The vehicle is ready to fly on, from ``now_s``, by the clock of the telemetry's stamps."""
+        self._cause, self._landed, self._full_told, self._ready_s = "", None, False, now_s
         self._spares = None if self._spares is None else self._spares - 1
         self.count += 1
-        return True
 
     def may_climb(self, telemetry: Telemetry, neighbours: Sequence[Neighbour]) -> bool:
         """Whether a drone that is ready again may take off now. ``neighbours``: with their places, not with their ways

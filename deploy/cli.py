@@ -21,6 +21,7 @@ from deploy.doctor_command import doctor
 from deploy.evaluate_command import evaluate
 from deploy.export_command import export_app
 from deploy.pki_command import pki_app
+from deploy.plan_command import plan
 from deploy.reconstruct_command import reconstruct
 from deploy.recording_command import recording_app
 from deploy.replay_command import replay
@@ -49,6 +50,7 @@ app.command(recording_app)
 app.command(export_app)
 app.command(pki_app)
 app.command(bench_app)
+app.command(plan)
 app.command(replay)
 app.command(evaluate)
 app.command(reconstruct)

@@ -74,9 +74,11 @@ class SimulatedVehicle:
         if self._authority == "ready":
             self._authority = "starting"
 
-    def make_ready(self) -> None:
-        if self._authority == "landed":
-            self._authority = "ready"
+    def make_ready(self) -> bool:
+        if self._authority != "landed":
+            return False
+        self._authority = "ready"
+        return True
 
     def condition(self) -> Condition:
         return Condition(self._authority)

@@ -93,9 +93,9 @@ class Vehicle(Protocol):
         """Come down here and stay on the ground, whatever is sent later; may be called again."""
         ...
 
-    def make_ready(self) -> None:
-        """It stands on the ground with another battery: from "landed" to "ready", as before its first take-off. Nothing
-        happens when it has not landed."""
+    def make_ready(self) -> bool:
+        """It stands on the ground with another battery: from "landed" to "ready", as before its first take-off. False
+        when it has not landed, or is armed: then nothing happens."""
         ...
 
     def leave(self, *, hold: bool) -> None:

@@ -139,34 +139,35 @@ def _name(flight: Flight, index: int, wanted: bool = True) -> str:
 
 
 def paths(flight: Flight, mission: Mission) -> str:
+    """As `draw_paths` draws them."""
+    return svg(lambda axes: draw_paths(axes, flight, mission), PLAN_INCHES)
+
+
+def draw_paths(axes: Axes, flight: Flight, mission: Mission) -> None:
     """Paths from above over the target B (filled) and the flight region P (dashed), with its boundary and no-fly zones
     (red; one that leaves a way above or below is paler). A dot starts, an arrow ends."""
+    from matplotlib.patches import Rectangle
 
-    def draw(axes: Axes) -> None:
-        from matplotlib.patches import Rectangle
-
-        for box, style in (
-            (mission.flight, {"fill": False, "edgecolor": FAINT, "linestyle": (0, (4, 3)), "label": "flight region P"}),
-            (mission.target, {"facecolor": "#eef2f6", "edgecolor": FAINT, "label": "target B"}),
-        ):
-            (x0, y0, _), (x1, y1, _) = box.lower_m, box.upper_m
-            axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, linewidth=0.8, **style))
-        _draw_zones(axes, mission)
-        for index, drone in enumerate(flight.drones):
-            path = flight.poses[:, index]
-            path = path[np.isfinite(path[:, 0])]
-            if not len(path):
-                continue
-            colour = drone_colour(index)
-            axes.plot(path[:, 0], path[:, 1], color=colour, linewidth=0.9, alpha=0.85, label=f"drone {drone}")
-            axes.plot(*path[0, :2], "o", color=colour, markersize=5, markeredgecolor="white")
-            yaw_deg = float(np.degrees(path[-1, 3]))
-            axes.plot(*path[-1, :2], marker=(3, 0, yaw_deg - 90), color=colour, markersize=9, markeredgecolor="white")
-        axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", anchor="N")
-        axes.autoscale_view()
-        axes.grid(visible=False)
-
-    return svg(draw, PLAN_INCHES)
+    for box, style in (
+        (mission.flight, {"fill": False, "edgecolor": FAINT, "linestyle": (0, (4, 3)), "label": "flight region P"}),
+        (mission.target, {"facecolor": "#eef2f6", "edgecolor": FAINT, "label": "target B"}),
+    ):
+        (x0, y0, _), (x1, y1, _) = box.lower_m, box.upper_m
+        axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, linewidth=0.8, **style))
+    _draw_zones(axes, mission)
+    for index, drone in enumerate(flight.drones):
+        path = flight.poses[:, index]
+        path = path[np.isfinite(path[:, 0])]
+        if not len(path):
+            continue
+        colour = drone_colour(index)
+        axes.plot(path[:, 0], path[:, 1], color=colour, linewidth=0.9, alpha=0.85, label=f"drone {drone}")
+        axes.plot(*path[0, :2], "o", color=colour, markersize=5, markeredgecolor="white")
+        yaw_deg = float(np.degrees(path[-1, 3]))
+        axes.plot(*path[-1, :2], marker=(3, 0, yaw_deg - 90), color=colour, markersize=9, markeredgecolor="white")
+    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", anchor="N")
+    axes.autoscale_view()
+    axes.grid(visible=False)
 
 
 def _draw_zones(axes: Axes, mission: Mission) -> None:

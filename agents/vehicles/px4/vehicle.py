@@ -112,9 +112,9 @@ class Px4Vehicle:
         with self._lock:
             self._logic.take_off(self._now_s())
 
-    def make_ready(self) -> None:
+    def make_ready(self) -> bool:
         with self._lock:
-            self._logic.make_ready(self._now_s())
+            return self._logic.make_ready(self._now_s())
 
     # What it says
 
