@@ -49,6 +49,7 @@ IN_FLIGHT: dict[str, tuple[dict[str, Any], dict[str, Any], Action]] = {
     "mission end": ({"finished": "J fell below 0.5"}, {"finished": ""}, "return"),
     "operator: return": ({"operator": "return"}, {"operator": "fly"}, "return"),
     "battery low": ({"battery": 0.25}, {"battery": 0.25 + BIT}, "return"),
+    "battery reserve": ({"reserve": 1.0}, {"reserve": 1.0 - BIT}, "return"),
     "gimbal lost": ({"gimbal_lost": True}, {"gimbal_lost": False}, "return"),
     "ground station lost": ({"ground_away_s": 60.0 + BIT}, {"ground_away_s": 60.0}, "hold"),
     "operator: pause": ({"operator": "hold"}, {"operator": "fly"}, "hold"),
@@ -70,6 +71,7 @@ FOR_GOOD = {
     "mission end",
     "operator: return",
     "battery low",
+    "battery reserve",
     "gimbal lost",
 }
 OPERATORS = {"operator: land", "operator: return", "operator: pause"}
@@ -134,6 +136,7 @@ def test_who_flies_decides_alone_what_may_be_ordered(authority: Authority) -> No
         (bad("telemetry stale"), "telemetry 0.5 s old"),
         (bad("battery critical"), "battery at 10%"),
         (bad("battery low"), "battery at 25%"),
+        (Situation("ours", battery=0.4, reserve=0.42), "battery at 40%, the way home is kept 42%"),
         (bad("geofence"), "0.50 m outside the flight region"),
         (bad("mission end"), "J fell below 0.5"),
         (bad("gimbal lost"), "the gimbal does not obey"),
