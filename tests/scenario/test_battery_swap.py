@@ -23,12 +23,12 @@ from protocol.mission_file import load_mission
 MISSION = """
 name = "swap"
 duration_s = 150
-stop_below = 0.35
+stop_below = 0.45
 [target]
 lower_m = [-1.2, -1.2, 0.0]
 upper_m = [1.2, 1.2, 0.6]
 [sensing]
-decay_per_s = 1.0
+decay_per_s = 0.1
 [flight]
 lower_m = [-2.0, -2.0, 0.5]
 upper_m = [2.0, 2.0, 2.5]
@@ -36,7 +36,7 @@ speed_max_mps = 0.8
 acceleration_max_mps2 = 6.0
 [controller]
 rate_hz = 10
-coverage_rate_per_s = 0.2
+coverage_rate_per_s = 0.02
 [feedback]
 method = "none"
 [camera]

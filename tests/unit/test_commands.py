@@ -183,3 +183,14 @@ def test_what_is_no_command_is_refused(parameters: dict[str, str], why: str) -> 
     with pytest.raises(MessageError) as refused:
         parse_command(parameters)
     assert why in str(refused.value)
+
+
+def test_resume_clears_a_drone_with_another_battery_only_where_a_crew_swaps() -> None:
+    assert isinstance(desk().consider("x", "resume", (1,), "flying"), str), "nobody is paused"
+    commanded = CommandDesk([3, 1, 2], clears_swapped=True)
+    first = take(commanded, "resume", 1, identity="a")
+    second = take(commanded, "resume", 1, identity="b")
+    assert actions(commanded) == {1: "fly"}
+    assert second.number > first.number, "each swap is cleared anew"
+    take(commanded, "land", 1)
+    assert isinstance(commanded.consider("c", "resume", (1,), "flying"), str)

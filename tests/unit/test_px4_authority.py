@@ -214,3 +214,25 @@ def test_old_news_of_the_mode_before_the_take_off_does_not_end_it() -> None:
     seen("TAKEOFF", 0.4, now_s=1.2)
     seen("HOLD", 1.3, now_s=2.2)
     assert logic.phase == "entering"
+
+
+def test_a_landed_vehicle_with_another_battery_takes_off_as_at_first(ours: Flight) -> None:
+    assert not ours.logic.make_ready(ours.now_s), "it flies"
+    ours.logic.land(direct=False)
+    ours.see(1.0, mode="LAND")
+    ours.see(on_ground=True, height_m=0.0)
+    assert not ours.logic.make_ready(ours.now_s), "it is armed"
+    ours.see(armed=False, mode="HOLD")
+    assert ours.authority == "landed"
+
+    assert ours.logic.make_ready(ours.now_s)
+    assert ours.authority == "ready"
+    assert ours.see() == [], "nobody ordered anything"
+    ours.logic.take_off(ours.now_s)
+    assert ours.see() == ["arm"]
+    assert ours.see(armed=True) == ["take_off"]
+    ours.see(3.0, mode="TAKEOFF")
+    ours.see(mode="TAKEOFF", on_ground=False, height_m=1.4)
+    assert ours.see(1.0, mode="HOLD") == ["offboard"]
+    ours.see(mode="OFFBOARD")
+    assert ours.authority == "ours"
