@@ -43,6 +43,7 @@ class Reserve:
         ids = sorted(other.id for other in mission.drones)
         self._rank, self._team = ids.index(drone), len(ids)
         self._samples: deque[tuple[float, float]] = deque()
+        self._known_per_s = 1.0 / mission.vehicles.battery_full_s
         self._fresh = True
         """Whether it flies on its first battery."""
         self.share = 0.0
@@ -68,19 +69,20 @@ class Reserve:
     def land(self) -> None:
         """It stands on the ground: what comes next is another flight, with another battery."""
         if self._samples:
-            self._fresh = False
+            self._known_per_s, self._fresh = self.use_per_s, False
         self._samples.clear()
         self._pathway.forget()
         self.share = self.home_s = 0.0
 
     @property
     def use_per_s(self) -> float:
-        """Share that each second of flight takes."""
-        least = 1.0 / self._vehicles.battery_full_s
+        """Share that each second of flight takes; in the first seconds, what it took with the battery before."""
         if not self._samples:
-            return least
+            return self._known_per_s
         (began_s, before), (now_s, left) = self._samples[0], self._samples[-1]
-        return max(least, (before - left) / (now_s - began_s)) if now_s - began_s >= LEARN_S else least
+        if now_s - began_s < LEARN_S:
+            return self._known_per_s
+        return max(1.0 / self._vehicles.battery_full_s, (before - left) / (now_s - began_s))
 
     def _home_s(self, telemetry: Telemetry) -> float:
         place, floor_m = telemetry.pose[:3], self._flight.lower_m[2]

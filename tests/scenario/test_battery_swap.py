@@ -53,9 +53,11 @@ report = false
 [simulation]
 scene = "{scene}"
 [simulation.battery]
-capacity_wh = 1.1
+capacity_wh = 1.3
 [vehicles]
 battery_low = 0.12
+battery_full_s = 40
+reserve_factor = 2
 battery_swap_s = 3
 [[drones]]
 id = 1
@@ -104,7 +106,7 @@ def test_three_drones_with_batteries_for_a_third_of_the_mission_finish_it_by_swa
     assert plan.reached, "J fell as far as it should"
     assert not plan.faults
     hover_s = run.mission.simulation.battery.hover_s
-    assert plan.duration_s >= 3 * hover_s * 0.9, "a battery is for a third of it"
+    assert plan.duration_s > 2.5 * hover_s, "a battery is for about a third of it"
     for drone in plan.drones:
         assert drone.batteries is not None
         assert drone.batteries >= 3

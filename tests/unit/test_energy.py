@@ -57,6 +57,14 @@ def test_nothing_is_learned_from_a_moment() -> None:
     assert learned(Reserve(mission(), 3), 0.02, LEARN_S + 1).use_per_s == pytest.approx(0.02)
 
 
+def test_with_another_battery_the_use_is_that_of_the_one_before_until_it_is_learned_anew() -> None:
+    reserve = learned(Reserve(mission(), 3), 0.02, 30.0)
+    reserve.land()
+    assert reserve.use_per_s == pytest.approx(0.02)
+    assert learned(reserve, 0.005, LEARN_S - 1).use_per_s == pytest.approx(0.02)
+    assert learned(reserve, 0.005, LEARN_S + 1).use_per_s == pytest.approx(0.005)
+
+
 def test_the_use_follows_what_is_flown_now() -> None:
     reserve = learned(Reserve(mission(), 3), 0.001, 100.0)
     for k in range(round(WINDOW_S * 20) + 20):
