@@ -49,7 +49,7 @@ def plan(
     checked = virtual(load_mission(mission, drones=drones, seed=seed))
     require_way_down(checked)
     path = picture or Path(f"{checked.name}-plan.png")
-    made = _fly(checked, _Progress(_display(checked)), path)
+    made = _fly(checked, _display(checked), path)
     if as_json:
         sys.stdout.write(json.dumps({**made.as_json(), "picture": str(path)}, indent=2) + "\n")
     else:
@@ -72,10 +72,10 @@ def _display(mission: Mission) -> Display:
 
 
 class _Progress:
-    """Shows the status alone: what a run says of its folder is not for a flight that leaves none."""
+    """Shows what a run says, but for where its ``folder`` is: this flight leaves none."""
 
-    def __init__(self, display: Display) -> None:
-        self._display = display
+    def __init__(self, display: Display, folder: str) -> None:
+        self._display, self._folder = display, folder
         self.said: list[str] = []
 
     def show(self, status: Status) -> None:
@@ -83,6 +83,8 @@ class _Progress:
 
     def say(self, text: str) -> None:
         self.said.append(text)
+        if self._folder not in text:
+            self._display.say(text)
 
     def __enter__(self) -> Self:
         self._display.__enter__()
@@ -92,7 +94,7 @@ class _Progress:
         self._display.__exit__(*raised)
 
 
-def _fly(mission: Mission, progress: _Progress, picture: Path) -> Plan:
+def _fly(mission: Mission, display: Display, picture: Path) -> Plan:
     """Raises `ProcessError` when the virtual flight fails."""
     from datetime import UTC, datetime
     from tempfile import TemporaryDirectory
@@ -104,6 +106,7 @@ def _fly(mission: Mission, progress: _Progress, picture: Path) -> Plan:
     from protocol.errors import ProcessError
 
     with TemporaryDirectory(prefix="covrecon-plan-") as folder:
+        progress = _Progress(display, folder)
         result = fly(mission, progress, out=Path(folder), speed="max", started=datetime.now(UTC))
         if result != 0:
             raise ProcessError("\n".join(["the virtual flight failed:", *progress.said]))
