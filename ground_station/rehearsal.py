@@ -28,13 +28,15 @@ DRIFT_M = 1e-4
 def rehearse(mission: Mission) -> int:
     """Map a flat, randomly patterned floor seen from a camera that moves sideways; how many images were fused.
 
-    Of ``mission`` it takes backend, refinement, weights and feedback alone: compiling does not depend on sizes. It
-    takes half a second, or the better part of a minute on a machine that has not compiled yet. For a map that is made
-    elsewhere, another one stands in, so that there is a mesh to compare.
+    Of ``mission`` it takes backend, device, refinement, weights and feedback alone: compiling does not depend on
+    sizes. It takes half a second, or the better part of a minute on a machine that has not compiled yet. For a map that
+    is made elsewhere, another one stands in, so that there is a mesh to compare.
     """
     asked = mission.reconstruction
     backend = "depth" if asked.backend == "external" else asked.backend
-    settings = Reconstruction(backend=backend, refine_poses=asked.refine_poses, learned=asked.learned)
+    settings = Reconstruction(
+        backend=backend, refine_poses=asked.refine_poses, learned=asked.learned, device=asked.device
+    )
     mission = mission.model_copy(update={"camera": Camera(), "target": Target(), "reconstruction": settings})
     intrinsics = mission.camera.intrinsics()
     lower, upper = np.array(mission.target.lower_m), np.array(mission.target.upper_m)

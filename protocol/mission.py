@@ -289,6 +289,12 @@ class Reconstruction(Settings):
     """... and of its attitude; for ``refine_poses`` alone."""
     workers: Annotated[int, Field(ge=1, le=64)] = 2
     """Threads that compute depth maps; the mesh does not depend on it."""
+    device: Literal["cpu", "cuda", "auto"] = "cpu"
+    """Where "plane_sweep" computes depth: "cuda" on a graphics card, which takes torch; "auto" there if there is one.
+    The two differ by rounding (docs/adr/0023)."""
+    memory_limit_mb: Positive = 2048.0
+    """That the map may take: a mission whose map needs more is refused, and one whose map grows beyond it is told. The
+    paper's box takes 130 MB, at 1.5 cm 0.4 GB, at 1 cm 1.1 GB. A volume above 8 GiB is refused whatever stands here."""
     external_patience_s: Annotated[float, Field(gt=0, le=60)] = 20.0
     """Wall time that a flight in lockstep waits for an external process's map, at each update and at the end."""
     learned: Learned = Learned()

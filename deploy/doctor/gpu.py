@@ -39,6 +39,6 @@ def check_gpu(answer: Ask = ask, *, has_torch: bool | None = None) -> Finding:
             "gpu",
             "warn",
             f"{gpus}, but torch {version or '(cannot be loaded)'} cannot use it",
-            "install a torch that was built for the driver's CUDA version; nothing here needs it yet",
+            'install a torch that was built for the driver\'s CUDA version, or leave reconstruction.device at "cpu"',
         )
     return Finding("gpu", "ok", f"{gpus or 'none found'}; torch {version}")

@@ -5,15 +5,18 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Final, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ground_station.reconstruction.depth_range import DepthRange
 from ground_station.reconstruction.plane_sweep import PlaneSweep
-from ground_station.reconstruction.semi_global import SemiGlobal
+from ground_station.reconstruction.semi_global import Disparity, SemiGlobal
 from ground_station.reconstruction.views import View
+from protocol.errors import ReconstructionError
 from protocol.mission import Reconstruction
 
 BEYOND: Final = 4.0
@@ -30,6 +33,32 @@ class DepthMap:
     """(H, W) correlation at that depth, in [0, 1]."""
 
 
+class Estimator(Protocol):
+    """May be called from several threads at once."""
+
+    def estimate(self, view: View, sources: Sequence[View], span: DepthRange) -> DepthMap: ...
+
+
+def make_estimator(width: int, height: int, settings: Reconstruction) -> Estimator:
+    """On the device that the mission asks for; ``width`` and ``height`` are those of the views.
+
+    Raises:
+        ReconstructionError: there is no torch, or no graphics card that it can use.
+    """
+    if settings.device == "cpu":
+        return DepthEstimator(width, height, settings)
+    has_torch = find_spec("torch") is not None
+    if not has_torch and settings.device == "cuda":
+        raise ReconstructionError(
+            'reconstruction.device "cuda" needs torch, built for the card: covrecon doctor tells what there is'
+        )
+    # By name: it imports torch, which only missions that ask for it need.
+    torch_sweep = import_module("ground_station.reconstruction.torch_sweep") if has_torch else None
+    if torch_sweep is None or (settings.device == "auto" and not torch_sweep.has_card()):
+        return DepthEstimator(width, height, settings)
+    return cast("Estimator", torch_sweep.TorchDepthEstimator(settings))
+
+
 class DepthEstimator:
     """May be called from several threads at once; each gets working memory of its own."""
 
@@ -41,15 +70,11 @@ class DepthEstimator:
 
     def estimate(self, view: View, sources: Sequence[View], span: DepthRange) -> DepthMap:
         """Depth of ``view`` between ``span.nearest`` and ``span.farthest``, within the mission's limits."""
-        settings = self._settings
-        nearest = max(span.nearest, settings.nearest_m)
-        farthest = max(min(span.farthest, settings.farthest_m), nearest * 1.01)
-        inverse_depths = planes(nearest, farthest, settings.depth_planes)
+        inverse_depths = inverse_depths_of(span, self._settings)
         sweep, aggregation = self._tools()
-        disparity = aggregation.aggregate(sweep.costs(view, sources, inverse_depths), view.grey)
-        step = (inverse_depths[-1] - inverse_depths[0]) / (settings.depth_planes - 1)
-        depth = np.float32(1) / (inverse_depths[0] + step * disparity.plane)
-        return DepthMap(np.where(disparity.score >= SCORE_MIN, depth, np.float32(0)), disparity.score)
+        return depth_map_of(
+            aggregation.aggregate(sweep.costs(view, sources, inverse_depths), view.grey), inverse_depths
+        )
 
     def _tools(self) -> tuple[PlaneSweep, SemiGlobal]:
         if not hasattr(self._thread, "tools"):
@@ -60,6 +85,20 @@ class DepthEstimator:
             )
         tools: tuple[PlaneSweep, SemiGlobal] = self._thread.tools
         return tools
+
+
+def inverse_depths_of(span: DepthRange, settings: Reconstruction) -> NDArray[np.float32]:
+    """Those of the planes to be swept."""
+    nearest = max(span.nearest, settings.nearest_m)
+    farthest = max(min(span.farthest, settings.farthest_m), nearest * 1.01)
+    return planes(nearest, farthest, settings.depth_planes)
+
+
+def depth_map_of(disparity: Disparity, inverse_depths: NDArray[np.float32]) -> DepthMap:
+    """The depths that are believed."""
+    step = (inverse_depths[-1] - inverse_depths[0]) / (len(inverse_depths) - 1)
+    depth = np.float32(1) / (inverse_depths[0] + step * disparity.plane)
+    return DepthMap(np.where(disparity.score >= SCORE_MIN, depth, np.float32(0)), disparity.score)
 
 
 def planes(nearest_m: float, farthest_m: float, count: int) -> NDArray[np.float32]:

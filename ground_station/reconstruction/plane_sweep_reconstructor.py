@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ground_station.reconstruction.admission import Admission
 from ground_station.reconstruction.consistency import agreements
-from ground_station.reconstruction.depth_map import DepthEstimator, DepthMap
+from ground_station.reconstruction.depth_map import DepthMap, make_estimator
 from ground_station.reconstruction.depth_range import DepthRange
 from ground_station.reconstruction.fusion import Volume
 from ground_station.reconstruction.ledger import Ledger
@@ -78,10 +78,10 @@ class PlaneSweepReconstructor:
         sweep = mission.sweep_intrinsics()
         self._width, self._height = sweep.width, sweep.height
         self._patience = round(PATIENCE_S / mission.tick_s)
-        self._estimator = DepthEstimator(self._width, self._height, settings)
+        self._estimator = make_estimator(self._width, self._height, settings)
         self._pool = ThreadPoolExecutor(settings.workers, thread_name_prefix="depth")
         self._volume = Volume(mission.target, settings.voxel_m, settings.truncation_m)
-        self._refiner = _make_refiner(mission)
+        self._refiner = make_refiner(mission)
         self._index = ViewIndex(VIEWS_KEPT)
         self._kept: list[_Entry | None] = [None] * VIEWS_KEPT
         self._unswept: list[_Entry] = []
@@ -232,7 +232,7 @@ class PlaneSweepReconstructor:
         self._due.clear()
 
 
-def _make_refiner(mission: Mission) -> PoseRefiner | None:
+def make_refiner(mission: Mission) -> PoseRefiner | None:
     settings, camera = mission.reconstruction, mission.camera
     if not settings.refine_poses:
         return None

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from importlib import import_module
+from importlib.util import find_spec
+
 import numpy as np
 import pytest
 
+from faults.plain_sweep import plain_costs
+from ground_station.reconstruction import depth_map
 from ground_station.reconstruction.consistency import agreements
-from ground_station.reconstruction.depth_map import DepthEstimator, planes
+from ground_station.reconstruction.depth_map import DepthEstimator, Estimator, make_estimator, planes
 from ground_station.reconstruction.depth_range import DepthRange, depth_range
 from ground_station.reconstruction.plane_sweep import COST_MAX, RADIUS, PlaneSweep, plane_homography
 from ground_station.reconstruction.views import View
+from protocol.errors import ReconstructionError
 from protocol.geometry import Floats, Intrinsics, camera_rotation
 from protocol.mission import Box, Reconstruction
 
@@ -142,3 +148,71 @@ def test_the_farthest_depth_has_a_plane_beyond_it_and_all_are_evenly_spaced(coun
     assert inverse[1] <= 1 / 2.05 + 1e-5
     assert inverse[-1] == pytest.approx(1 / 0.35)
     np.testing.assert_allclose(steps, steps[0], rtol=1e-3)
+
+
+def test_the_costs_are_those_of_the_plain_form(views: list[View]) -> None:
+    inverse_depths = np.linspace(0.5, 1.2, 12, dtype=np.float32)
+    for sources in (views[1:2], views[1:3], views[1:]):
+        costs = PlaneSweep(CAMERA.width, CAMERA.height, 4, 12).costs(views[0], sources, inverse_depths)
+        difference = np.abs(costs.astype(int) - plain_costs(views[0], sources, inverse_depths))
+        assert costs.min() < 30
+        assert np.mean(difference <= 1) > 0.999, "the rest sees the image's edge by rounding"
+
+
+needs_torch = pytest.mark.skipif(find_spec("torch") is None, reason="torch is not installed (extra learned)")
+
+
+def on_torch(device: str) -> Estimator:
+    estimator: Estimator = import_module("ground_station.reconstruction.torch_sweep").TorchDepthEstimator(
+        Reconstruction(), device
+    )
+    return estimator
+
+
+def has_card() -> bool:
+    return bool(import_module("torch").cuda.is_available())
+
+
+def assert_the_same_depth(found: depth_map.DepthMap, expected: depth_map.DepthMap) -> None:
+    known, expected_known = found.depth > 0, expected.depth > 0
+    assert expected_known.mean() > 0.8
+    assert np.mean(known == expected_known) > 0.995
+    both = known & expected_known
+    apart = np.abs(found.depth - expected.depth)[both] / expected.depth[both]
+    assert np.quantile(apart, 0.99) < 1e-3
+    assert np.quantile(np.abs(found.score - expected.score)[both], 0.99) < 0.01
+    assert (found.depth.dtype, found.score.dtype) == (np.float32, np.float32)
+
+
+@needs_torch
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_torch_finds_the_same_depth(views: list[View], estimator: DepthEstimator, count: int) -> None:
+    sources = views[1 : 1 + count]
+    assert_the_same_depth(
+        on_torch("cpu").estimate(views[0], sources, SPAN), estimator.estimate(views[0], sources, SPAN)
+    )
+
+
+@needs_torch
+def test_a_graphics_card_finds_the_same_depth(views: list[View], estimator: DepthEstimator) -> None:
+    if not has_card():
+        pytest.skip("there is no graphics card that torch can use")
+    found = on_torch("cuda").estimate(views[0], views[1:], SPAN)
+    assert_the_same_depth(found, estimator.estimate(views[0], views[1:], SPAN))
+
+
+@needs_torch
+def test_without_a_card_a_mission_that_asks_for_one_is_refused_and_auto_does_without() -> None:
+    if has_card():
+        pytest.skip("there is a graphics card")
+    with pytest.raises(ReconstructionError, match="sees no graphics card"):
+        make_estimator(128, 72, Reconstruction(device="cuda"))
+    assert isinstance(make_estimator(128, 72, Reconstruction(device="auto")), DepthEstimator)
+
+
+def test_without_torch_a_card_is_refused_and_auto_does_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(depth_map, "find_spec", lambda _name: None)
+    with pytest.raises(ReconstructionError, match="needs torch"):
+        make_estimator(128, 72, Reconstruction(device="cuda"))
+    for device in ("cpu", "auto"):
+        assert isinstance(make_estimator(128, 72, Reconstruction.model_validate({"device": device})), DepthEstimator)
