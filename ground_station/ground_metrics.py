@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import get_args
 
 from prometheus_client import CollectorRegistry
@@ -17,6 +18,17 @@ MODES = ("waiting", *get_args(Mode))
 """Of a `DroneStatus`; "waiting": never heard."""
 
 
+@dataclass(frozen=True, slots=True)
+class MapLoad:
+    """What the map has to do, and what it takes."""
+
+    backlog: int = 0
+    """Images that wait for it."""
+    passed_over: int = 0
+    """Images for which it had no time."""
+    memory_bytes: int = 0
+
+
 class GroundMetrics(Collector):
     """All but `collect`, which a scrape's thread calls, belongs to the event loop; what passes between is immutable."""
 
@@ -24,7 +36,7 @@ class GroundMetrics(Collector):
         """``now_s``: monotonic seconds, callable from any thread, by which a link's age is measured."""
         self._now_s = now_s
         self._status: Status | None = None
-        self._backlog = 0
+        self._load = MapLoad()
         self._recording: RecordingStatistics | None = None
         self._heard: dict[int, tuple[float, DroneState]] = {}
         registry.register(self)
@@ -32,14 +44,13 @@ class GroundMetrics(Collector):
     def hear_state(self, state: DroneState) -> None:
         self._heard[state.drone] = (self._now_s(), state)
 
-    def hear_status(self, status: Status, *, backlog: int, recording: RecordingStatistics | None = None) -> None:
-        """``backlog``: images that wait for the map."""
-        self._status, self._backlog, self._recording = status, backlog, recording
+    def hear_status(self, status: Status, load: MapLoad, *, recording: RecordingStatistics | None = None) -> None:
+        self._status, self._load, self._recording = status, load, recording
 
     def collect(self) -> Iterator[Metric]:
         """Figures of the newest status; none before the first."""
         if self._status is not None:
-            yield from _of_mission(self._status, self._backlog)
+            yield from _of_mission(self._status, self._load)
             yield from _of_drones(self._status.drones)
         if self._recording is not None:
             yield from _of_recording(self._recording)
@@ -61,7 +72,7 @@ class GroundMetrics(Collector):
         yield from (age, battery, lag)
 
 
-def _of_mission(status: Status, backlog: int) -> Iterator[Metric]:
+def _of_mission(status: Status, load: MapLoad) -> Iterator[Metric]:
     gauge, counter = GaugeMetricFamily, CounterMetricFamily
     yield gauge("covrecon_tick", "Newest tick of the mission.", status.tick)
     yield gauge("covrecon_importance", "J: mean importance of all cells.", status.importance)
@@ -72,7 +83,11 @@ def _of_mission(status: Status, backlog: int) -> Iterator[Metric]:
     yield _states("covrecon_phase", "1 for the phase that the mission is in.", "phase", get_args(Phase), status.phase)
     yield counter("covrecon_keyframes", "Images that the map took in.", status.keyframes)
     yield counter("covrecon_dropped_keyframes", "Images that were lost or are of no use.", status.dropped)
-    yield gauge("covrecon_backlog_keyframes", "Images that wait for the map.", backlog)
+    yield counter("covrecon_passed_over_keyframes", "Images for which the map had no time.", load.passed_over)
+    yield gauge("covrecon_backlog_keyframes", "Images that wait for the map.", load.backlog)
+    yield gauge(
+        "covrecon_map_memory_bytes", "Of the map, the keyframes that it keeps, and its mesh.", load.memory_bytes
+    )
     yield counter("covrecon_jumps", "Map updates that made phi jump.", status.jumps)
     yield gauge("covrecon_min_separation_meters", "Smallest distance of two drones so far.", status.min_separation_m)
     yield gauge("covrecon_loop_lag_p99_seconds", "How late the event loop wakes.", status.loop_lag_s)

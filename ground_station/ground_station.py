@@ -17,7 +17,7 @@ from prometheus_client import CollectorRegistry
 from ground_station.command_log import COMMANDS_FILE, CommandLog
 from ground_station.command_service import CommandService
 from ground_station.external_map import ExternalMap
-from ground_station.ground_metrics import GroundMetrics
+from ground_station.ground_metrics import GroundMetrics, MapLoad
 from ground_station.journal import JOURNAL_FILE, Journal, open_journal
 from ground_station.jump_publisher import JumpPublisher
 from ground_station.keyframe_log import KEYFRAMES_FILE, KeyframeLog
@@ -84,7 +84,7 @@ class GroundStation:
         self._board = StatusBoard(mission, self._news.tell)
         self._synchroniser = Synchroniser(bus, self._replication, rank=self._board.lost_states)
         self._jumps = JumpPublisher(bus, journal, self._replication)
-        self._feedback = MapFeedback(mission, mapper, self._jumps, recorder, lockstep=lockstep)
+        self._feedback = MapFeedback(mission, mapper, self._jumps, recorder, self._news.tell, lockstep=lockstep)
         self._recovery = Recovery(mission, bus, run, self._replication, self._jumps, self._feedback, mapper)
         self._clock = clock_of(mission, bus, lockstep=lockstep, now_s=asyncio.get_running_loop().time)
         self._lag = LoopLag()
@@ -280,7 +280,11 @@ class GroundStation:
         )
         self._bus.put(topics.STATUS, status)
         self._recorder.heard(topics.STATUS, status, status.tick)
-        self._figures.hear_status(status, backlog=self._feedback.backlog, recording=self._recorder.statistics())
+        self._figures.hear_status(
+            status,
+            MapLoad(self._feedback.backlog, self._feedback.passed_over, self._mapper.memory_bytes),
+            recording=self._recorder.statistics(),
+        )
 
     # --- the end -------------------------------------------------------------------------------------------------
 

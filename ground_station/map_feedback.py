@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TypeVar
@@ -17,12 +17,15 @@ from typing import TypeVar
 from ground_station.evaluation import Scores
 from ground_station.feedback import FeedbackSchedule
 from ground_station.jump_publisher import JumpPublisher
+from ground_station.keyframe_backlog import KeyframeBacklog
 from ground_station.mapper import Mapper, MapUpdate
+from ground_station.reconstruction.memory import MEGABYTE
 from ground_station.reconstruction.reconstructor import Mesh
 from ground_station.recording.recorder import Recorder
 from protocol import topics
 from protocol.messages import Keyframe
 from protocol.mission import Mission
+from protocol.news import Tell
 
 T = TypeVar("T")
 
@@ -30,8 +33,8 @@ SCORE_PERIOD_S = 10.0
 """Mission time between two live F-scores."""
 LEAD_TICKS = 8
 """How far ahead of this process the simulator may fly in lockstep; in real time, how long a jump gets to travel."""
-KEYFRAME_BACKLOG = 200
-"""Keyframes that may wait for the map in real time; beyond it the newest are dropped and counted."""
+LOOKS_WAITING = 2
+"""Map updates that may wait in real time; while so many do, none is begun."""
 
 
 @dataclass(slots=True)
@@ -46,44 +49,61 @@ class _Update:
 
 class MapFeedback:
     def __init__(
-        self, mission: Mission, mapper: Mapper, jumps: JumpPublisher, recorder: Recorder, *, lockstep: bool
+        self,
+        mission: Mission,
+        mapper: Mapper,
+        jumps: JumpPublisher,
+        recorder: Recorder,
+        tell: Tell,
+        *,
+        lockstep: bool,
+        backlog: KeyframeBacklog | None = None,
     ) -> None:
+        """``tell``: who wants to know when the map is too slow, or too large."""
         self._mission, self._mapper, self._jumps, self._lockstep = mission, mapper, jumps, lockstep
-        self._recorder = recorder
+        self._recorder, self._tell = recorder, tell
+        self._backlog = backlog or KeyframeBacklog(mission.camera)
+        self._told: set[str] = set()
         self._schedule = FeedbackSchedule(mission.feedback, mission.tick_s)
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="mapper")
         self._adding: set[asyncio.Task[None]] = set()
         self._updates: deque[_Update] = deque()
         self._received: deque[Keyframe] = deque()
         self._newest: dict[int, int] = {}
+        self._tick = 0
         self._scored_at = -math.inf
         self.received = 0
         self.handed = 0
         """Keyframes given to the map; in lockstep the simulator may be some ticks and images ahead."""
         self.mapped = 0
         self.dropped = 0
-        """Keyframes that were lost on the way or for which there was no time."""
+        """Keyframes that were lost on the way."""
+        self._closed = False
         self.scores: Scores | None = None
         self.mesh: Mesh | None = None
         """The newest."""
 
     @property
     def backlog(self) -> int:
-        return self.handed - self.mapped
+        """Keyframes that wait for the map, or that it is taking in."""
+        return self._backlog.waiting + self.handed - self.mapped
+
+    @property
+    def passed_over(self) -> int:
+        """Keyframes for which there was no time; they are in the log."""
+        return self._backlog.passed_over
 
     @property
     def unused(self) -> int:
         """Keyframes that did not make it into the map."""
-        return self.dropped + self._mapper.refused
+        return self.dropped + self._backlog.passed_over + self._backlog.lost + self._mapper.refused
 
     def resume(self, restore: Callable[[], None], *, sent: int) -> None:
         """Go on after a restart: ``restore`` the map first; ``sent`` keyframes were sent so far, in all."""
         self.handed = self.mapped = self._mapper.taken
         self.received = sent
         self.dropped = max(0, sent - self.handed)
-        task = asyncio.create_task(self.on_worker(restore))
-        self._adding.add(task)
-        task.add_done_callback(self._adding.discard)
+        self._track(asyncio.create_task(self.on_worker(restore)))
 
     def hear(self, keyframe: Keyframe) -> None:
         """Also notices those before it that never came."""
@@ -104,19 +124,54 @@ class MapFeedback:
             key=lambda keyframe: (keyframe.tick, keyframe.drone),
         )
         self._received = deque(keyframe for keyframe in self._received if keyframe.tick >= tick)
+        self._tick = tick
         if not ready:
             return
-        if not self._lockstep and self.backlog >= KEYFRAME_BACKLOG:
-            self.dropped += len(ready)
+        if self._lockstep:
+            self._map(ready)
             return
-        self.handed += len(ready)
-        self._recorder.handed_over(tick, ready)
-        task = asyncio.create_task(self._add(ready))
-        self._adding.add(task)
-        task.add_done_callback(self._adding.discard)
+        self._backlog.put(ready)
+        if self._backlog.passed_over:
+            self._say_once(
+                "slow",
+                "the map is slower than images come: those that show the least new are passed over, and kept for "
+                "covrecon reconstruct",
+            )
+        self._go_on()
 
-    async def _add(self, keyframes: list[Keyframe]) -> None:
-        await self.on_worker(lambda: self._mapper.add(keyframes))
+    def _go_on(self) -> None:
+        """Give the map what waits, one turn at a time: meanwhile it is decided what it can best do without."""
+        if self._adding:
+            return
+        turn = self._backlog.take()
+        if turn.passed_over or turn.keyframes:
+            self._map(turn.keyframes, turn.passed_over)
+
+    def _map(self, keyframes: Sequence[Keyframe], passed_over: Sequence[Keyframe] = ()) -> None:
+        self.handed += len(keyframes)
+        if keyframes:
+            self._recorder.handed_over(self._tick, keyframes)
+        self._track(asyncio.create_task(self._add(keyframes, passed_over)))
+
+    def _track(self, task: asyncio.Task[None]) -> None:
+        self._adding.add(task)
+        task.add_done_callback(self._done)
+
+    def _done(self, task: asyncio.Task[None]) -> None:
+        self._adding.discard(task)
+        if not (self._lockstep or task.cancelled() or self._closed):
+            self._go_on()
+
+    def _say_once(self, what: str, text: str) -> None:
+        if what not in self._told:
+            self._told.add(what)
+            self._tell("warning", "map", text)
+
+    async def _add(self, keyframes: Sequence[Keyframe], passed_over: Sequence[Keyframe]) -> None:
+        if passed_over:
+            await self.on_worker(lambda: self._mapper.keep(passed_over))
+        if keyframes:
+            await self.on_worker(lambda: self._mapper.add(keyframes))
         self.mapped += len(keyframes)
 
     async def on_worker(self, work: Callable[[], T]) -> T:
@@ -125,7 +180,7 @@ class MapFeedback:
 
     def look(self, tick: int, importance: float) -> None:
         """Begin a map update if one is due at ``tick``, with J at that tick."""
-        if not self._schedule.is_due(tick):
+        if not self._schedule.is_due(tick) or (not self._lockstep and len(self._updates) >= LOOKS_WAITING):
             return
         time_s = tick * self._mission.tick_s
         scored = time_s - self._scored_at >= SCORE_PERIOD_S
@@ -149,6 +204,7 @@ class MapFeedback:
             self._updates.popleft()
             self.scores = result.scores or self.scores
             self.mesh = result.mesh
+            self._check_memory()
             self._recorder.mesh(update.tick, result.mesh)
             increments = self._schedule.increments(result.change, update.importance)
             if increments is not None:
@@ -170,12 +226,23 @@ class MapFeedback:
         """The complete map, scored."""
         for update in self._updates:
             update.task.cancel()
-        if self._adding:
+        while self._adding:  # each that ends begins the next
             await asyncio.wait(self._adding)
         result = await self.on_worker(self._mapper.finish)
         self.scores = result.scores or self.scores
         self.mesh = result.mesh
         return result
 
+    def _check_memory(self) -> None:
+        limit_mb = self._mission.reconstruction.memory_limit_mb
+        taken_mb = self._mapper.memory_bytes / MEGABYTE
+        if taken_mb > limit_mb:
+            self._say_once(
+                "memory",
+                f"the map takes {taken_mb:.0f} MB, more than reconstruction.memory_limit_mb {limit_mb:g}, of which "
+                f"{self.mesh.size_bytes / MEGABYTE if self.mesh else 0:.0f} MB its mesh; larger voxels need less",
+            )
+
     def close(self) -> None:
+        self._closed = True
         self._worker.shutdown(wait=False, cancel_futures=True)

@@ -83,6 +83,13 @@ class Mapper:
         self._compared, self._comparing_s = 0, 0.0
         self.refused = 0
         """Images or poses that could not be read, or that the reconstructor cannot use."""
+        self.memory_bytes = 0
+        """Of map and mesh at the last update."""
+
+    def keep(self, keyframes: Sequence[messages.Keyframe]) -> None:
+        """Only log keyframes for which there is no time now: a map that is made from the log will have them."""
+        for message in keyframes:
+            self._log.append(message)
 
     def add(self, keyframes: Sequence[messages.Keyframe]) -> None:
         """Take in keyframes in order; what cannot be used is counted and said, and the mission goes on."""
@@ -94,6 +101,9 @@ class Mapper:
     def _map(self, keyframes: Sequence[messages.Keyframe]) -> None:
         readable = (self._read(message) for message in keyframes)
         self._reconstructor.add([keyframe for keyframe in readable if keyframe is not None])
+        self._count_refused()
+
+    def _count_refused(self) -> None:
         self.refused = self._unreadable + self.unlocated + sum(self._reconstructor.statistics().refused.values())
 
     def _read(self, message: messages.Keyframe) -> Keyframe | None:
@@ -123,6 +133,7 @@ class Mapper:
     def update(self, *, scored: bool) -> MapUpdate:
         """The mesh of all that is fused by now, and where it changed."""
         mesh = self._reconstructor.mesh()
+        self.memory_bytes = self.statistics.memory_bytes + mesh.size_bytes
         began_s = time.perf_counter()
         change = self._change.update(mesh)
         self._comparing_s += time.perf_counter() - began_s
@@ -139,7 +150,7 @@ class Mapper:
         """The last mesh, with what still waited for later views, scored in full."""
         self._reconstructor.flush()
         mesh = self._reconstructor.mesh()
-        self.refused = self._unreadable + sum(self._reconstructor.statistics().refused.values())
+        self._count_refused()
         return MapUpdate(mesh, self._change.update(mesh), self._score(mesh, FULL_SAMPLES) if scored else None)
 
     @property

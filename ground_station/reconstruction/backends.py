@@ -8,6 +8,7 @@ from typing import cast
 from ground_station.external_map import ExternalMap
 from ground_station.reconstruction.depth_reconstructor import DepthReconstructor
 from ground_station.reconstruction.external_reconstructor import ExternalReconstructor
+from ground_station.reconstruction.memory import check_memory
 from ground_station.reconstruction.plane_sweep_reconstructor import PlaneSweepReconstructor
 from ground_station.reconstruction.reconstructor import NullReconstructor, Reconstructor
 from protocol.errors import ReconstructionError
@@ -18,9 +19,10 @@ def make_reconstructor(mission: Mission, external: ExternalMap | None = None) ->
     """A new, empty one; ``external``: the process that a mission with that backend flies with.
 
     Raises:
-        ReconstructionError: the map would not fit in memory, is another process's that is not here, or its method
-            lacks what it needs.
+        ReconstructionError: the map would take more memory than the mission allows, is another process's that is not
+            here, or its method lacks what it needs.
     """
+    check_memory(mission)
     match mission.reconstruction.backend:
         case "none":
             return NullReconstructor()

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Sequence
+from typing import Final
 
 import numpy as np
 
 from ground_station.external_map import ExternalMap
 from ground_station.reconstruction.reconstructor import Keyframe, Mesh, Outcome, State, Statistics
+
+WAITING_MAX: Final = 100_000
+"""Keyframes without a map that has them; before more are, the oldest are given up: a process may be away for good."""
 
 
 class ExternalReconstructor:
@@ -27,15 +31,16 @@ class ExternalReconstructor:
         self._decide()
         self._received += len(keyframes)
         self._waiting += ((keyframe.drone, keyframe.sequence, place) for keyframe in keyframes)
+        while len(self._waiting) > WAITING_MAX:
+            self._give_up(*self._waiting.popleft())
         return (*(Outcome(one.drone, one.sequence, "waiting") for one in keyframes), *self._take_decided())
 
     def flush(self) -> tuple[Outcome, ...]:
         if self._waiting:
             self._process.mesh_of(self._process.grow(), last=True)
         self._decide()
-        self._decided += (Outcome(drone, sequence, "refused", "unanswered") for drone, sequence, _ in self._waiting)
-        self._unanswered += len(self._waiting)
-        self._waiting.clear()
+        while self._waiting:
+            self._give_up(*self._waiting.popleft())
         return self._take_decided()
 
     def mesh(self) -> Mesh:
@@ -50,7 +55,7 @@ class ExternalReconstructor:
             fused=self._fused,
             waiting=len(self._waiting),
             refused={"unanswered": self._unanswered} if self._unanswered else {},
-            memory_bytes=mesh.vertices.nbytes + mesh.faces.nbytes + mesh.colors.nbytes,
+            memory_bytes=mesh.size_bytes,
         )
 
     @property
@@ -81,6 +86,10 @@ class ExternalReconstructor:
             drone, sequence, _ = self._waiting.popleft()
             self._decided.append(Outcome(drone, sequence, "fused"))
             self._fused += 1
+
+    def _give_up(self, drone: int, sequence: int, _place: int) -> None:
+        self._decided.append(Outcome(drone, sequence, "refused", "unanswered"))
+        self._unanswered += 1
 
     def _take_decided(self) -> tuple[Outcome, ...]:
         decided = tuple(self._decided)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ground_station.reconstruction.views import View
 from protocol.errors import ReconstructionError
+from protocol.geometry import Floats
 from protocol.mission import Box
 
 BYTES_PER_VOXEL: Final = 11
@@ -33,9 +34,7 @@ class Volume:
     """
 
     def __init__(self, box: Box, voxel_m: float, truncation_m: float) -> None:
-        margin = voxel_m * np.ceil(truncation_m / voxel_m)
-        self.origin = np.array(box.lower_m) - margin
-        shape = np.ceil((np.array(box.upper_m) + margin - self.origin) / voxel_m - 1e-6).astype(int) + 1
+        self.origin, shape = _lattice(box, voxel_m, truncation_m)
         if float(np.prod(shape.astype(float))) * BYTES_PER_VOXEL > BYTES_MAX:
             raise ReconstructionError(
                 f"reconstruction.voxel_m {voxel_m:g}: the volume would take over {BYTES_MAX >> 30} GiB"
@@ -45,6 +44,12 @@ class Volume:
         self.distance = np.zeros(shape, np.float32)
         self.weight = np.zeros(shape, np.float32)
         self.color = np.zeros((*shape, 3), np.uint8)
+
+    @staticmethod
+    def voxels(box: Box, voxel_m: float, truncation_m: float) -> tuple[int, int, int]:
+        """How many along x, y and z one would have."""
+        x, y, z = _lattice(box, voxel_m, truncation_m)[1].tolist()
+        return x, y, z
 
     @property
     def size_bytes(self) -> int:
@@ -137,6 +142,13 @@ class Volume:
         here = tuple(slice(low, low + count) for low, count in zip(first, size, strict=True))
         block = tuple(slice(count) for count in size)
         _blend(self.distance[here], self.weight[here], self.color[here], distance[block], weight[block], color[block])
+
+
+def _lattice(box: Box, voxel_m: float, truncation_m: float) -> tuple[Floats, NDArray[np.int64]]:
+    """Place of the first voxel and number of voxels along each axis."""
+    margin = voxel_m * np.ceil(truncation_m / voxel_m)
+    origin = np.array(box.lower_m) - margin
+    return origin, np.ceil((np.array(box.upper_m) + margin - origin) / voxel_m - 1e-6).astype(int) + 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -100,6 +100,10 @@ class Mesh:
     colors: NDArray[np.uint8]
     """(V, 3) RGB."""
 
+    @property
+    def size_bytes(self) -> int:
+        return self.vertices.nbytes + self.faces.nbytes + self.colors.nbytes
+
     @classmethod
     def empty(cls) -> Mesh:
         return cls(np.empty((0, 3), np.float32), np.empty((0, 3), np.int32), np.empty((0, 3), np.uint8))

@@ -32,12 +32,15 @@ class ScriptedMapper:
         self._marked = marked(field)
         self._seed = seed
         self._updates = 0
-        self.taken = self.refused = self.unlocated = 0
+        self.taken = self.refused = self.unlocated = self.memory_bytes = 0
         self.feedback_update_s = None
         """Nothing is compared here."""
 
     def add(self, keyframes: Sequence[messages.Keyframe]) -> None:
         """Images say nothing here."""
+
+    def keep(self, keyframes: Sequence[messages.Keyframe]) -> None:
+        """Nothing is logged here."""
 
     def update(self, *, scored: bool) -> MapUpdate:
         del scored

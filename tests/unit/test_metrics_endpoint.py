@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from agents.agent_metrics import AgentMetrics
 from faults.ports import free_port
 from faults.scrape import Series, samples, scrape, series
-from ground_station.ground_metrics import GroundMetrics
+from ground_station.ground_metrics import GroundMetrics, MapLoad
 from ground_station.recording.recorder import RecordingStatistics
 from protocol.messages import Control, DroneState, DroneStatus, ReplicaState, Status
 from protocol.metrics_endpoint import MetricsEndpoint, metrics_port
@@ -170,13 +170,13 @@ def test_an_agent_that_has_not_decided_has_no_figures_of_decisions(registry: Col
 
 
 def test_the_missions_figures_are_those_of_the_newest_status(registry: CollectorRegistry) -> None:
-    GroundMetrics(registry).hear_status(STATUS, backlog=8)
+    GroundMetrics(registry).hear_status(STATUS, MapLoad(backlog=8, passed_over=6, memory_bytes=7))
     found = read(registry)
 
     expected = {
         "tick": 100, "importance": 0.6, "keyframes_total": 50, "dropped_keyframes_total": 2, "backlog_keyframes": 8,
         "jumps_total": 9, "min_separation_meters": 1.2, "loop_lag_p99_seconds": 0.004, "refused_messages_total": 1,
-        "unwritten_records_total": 3, "lost_states_total": 5,
+        "unwritten_records_total": 3, "lost_states_total": 5, "passed_over_keyframes_total": 6, "map_memory_bytes": 7,
     }  # fmt: skip
     assert {name: found[series(f"covrecon_{name}")] for name in expected} == expected
     assert found[series("covrecon_f_score_ratio", {"surface": "visible"})] == 0.7
@@ -188,7 +188,7 @@ def test_the_missions_figures_are_those_of_the_newest_status(registry: Collector
 def test_each_drone_has_its_own_figures(registry: CollectorRegistry) -> None:
     now_s = 50.0
     metrics = GroundMetrics(registry, now_s=lambda: now_s)
-    metrics.hear_status(STATUS, backlog=0)
+    metrics.hear_status(STATUS, MapLoad())
     metrics.hear_state(STATE)
     now_s = 50.75
     found = read(registry)
@@ -211,7 +211,7 @@ def test_each_drone_has_its_own_figures(registry: CollectorRegistry) -> None:
 
 def test_what_the_recorder_dropped_is_told_by_channel(registry: CollectorRegistry) -> None:
     metrics = GroundMetrics(registry)
-    metrics.hear_status(STATUS, backlog=0, recording=RECORDED)
+    metrics.hear_status(STATUS, MapLoad(), recording=RECORDED)
     found = read(registry)
 
     assert found[series("covrecon_recorded_messages_total", {"channel": "/tf"})] == 100
@@ -221,5 +221,5 @@ def test_what_the_recorder_dropped_is_told_by_channel(registry: CollectorRegistr
     assert found[series("covrecon_recorder_stall_seconds")] == 0.31
     assert found[series("covrecon_recorder_failed")] == 0
 
-    metrics.hear_status(STATUS, backlog=0, recording=replace(RECORDED, failed="disk full"))
+    metrics.hear_status(STATUS, MapLoad(), recording=replace(RECORDED, failed="disk full"))
     assert read(registry)[series("covrecon_recorder_failed")] == 1

@@ -15,7 +15,7 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.core import Metric
 
 from agents.agent_metrics import AgentMetrics
-from ground_station.ground_metrics import GroundMetrics
+from ground_station.ground_metrics import GroundMetrics, MapLoad
 from ground_station.recording.channels import _SCHEMAS, CHANNELS
 from ground_station.recording.recorder import RecordingStatistics
 from ground_station.recording.stored import schema_of
@@ -83,7 +83,7 @@ def told() -> dict[str, set[str]]:
     ground.hear_state(state)
     ground.hear_status(
         status,
-        backlog=0,
+        MapLoad(),
         recording=RecordingStatistics(
             written={"/a": 1}, dropped={"/a": 1}, bytes=1, worst_stall_s=0, queue=0, failed=""
         ),
