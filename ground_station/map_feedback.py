@@ -168,10 +168,13 @@ class MapFeedback:
             self._tell("warning", "map", text)
 
     async def _add(self, keyframes: Sequence[Keyframe], passed_over: Sequence[Keyframe]) -> None:
-        if passed_over:
-            await self.on_worker(lambda: self._mapper.keep(passed_over))
-        if keyframes:
-            await self.on_worker(lambda: self._mapper.add(keyframes))
+        def add() -> None:  # at once: what is recorded is the order in which the worker is asked
+            if passed_over:
+                self._mapper.keep(passed_over)
+            if keyframes:
+                self._mapper.add(keyframes)
+
+        await self.on_worker(add)
         self.mapped += len(keyframes)
 
     async def on_worker(self, work: Callable[[], T]) -> T:
