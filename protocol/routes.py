@@ -185,9 +185,9 @@ class Routes:
 
 @lru_cache(maxsize=64)
 def routes_of(flight: Flight) -> Routes | None:
-    """None where there are no zones: every way is straight then."""
+    """None where there are no zones: every way is straight then, also within a boundary that is convex."""
     airspace = airspace_of(flight)
-    if airspace.is_open:
+    if not airspace.names:
         return None
     return Routes(airspace, np.array(flight.lower_m), np.array(flight.upper_m))
 
