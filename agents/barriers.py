@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from agents.obstacles import Obstacles
 from protocol.airspace import airspace_of
 from protocol.geometry import Floats
 from protocol.mission import Flight, Mission
@@ -64,8 +65,8 @@ def predicted_pose(pose: Floats, velocity: Floats, flight: Flight) -> Floats:
 
 REGION = ("region:-x", "region:-y", "region:-z", "region:+x", "region:+y", "region:+z")
 PITCH = "pitch"
-SEPARATION, ZONE = "separation", "zone"
-"""Kinds of rows: ``separation:<id>``, ``zone:<name>``."""
+SEPARATION, ZONE, OBSTACLE = "separation", "zone", "obstacle"
+"""Kinds of rows: ``separation:<id>``, ``zone:<name>``, ``obstacle:<n>``."""
 FIXED_ROWS = 1 + len(REGION)
 """Rows that a lone drone has."""
 
@@ -84,12 +85,17 @@ class Barriers:
         self._flight = flight
         self._wide, self._top_speed = widened_separation(flight), top_speed(flight)
         self._airspace = airspace_of(flight)
+        self._obstacles: Obstacles | None = None
         # A zone that is farther away is no limit: not even at top speed does its barrier shrink as fast as it may.
         self._reach_m = self._top_speed / self._gain
         self._speed = np.array(flight.velocity_limits)
         self._change = np.full(5, np.inf)
         if flight.response_time_s > 0:
             self._change = np.array(flight.acceleration_limits) * flight.response_time_s
+
+    def heed(self, obstacles: Obstacles) -> None:
+        """From now on there are rows of these too."""
+        self._obstacles = obstacles
 
     def rows(self, predicted: Floats, neighbours: Sequence[Neighbour]) -> Rows:
         """All strict rows at the predicted pose (5,).
@@ -101,6 +107,7 @@ class Barriers:
         that has been silent for ``age`` keeps its place, and D grows by ``age`` times its top speed; and by what the
         two estimates may be off beyond what the mission says.
         zone:<name>: one per convex part of a zone that may be a limit, b = distance from it less D.
+        obstacle:<n>: one per box of cells that are not free and may be a limit (`agents.obstacle_rows`).
         """
         positions = np.array([neighbour.position for neighbour in neighbours]).reshape(-1, 3)
         distances = np.array([self._distance(neighbour) for neighbour in neighbours])
@@ -111,16 +118,15 @@ class Barriers:
         bounds[0] = -self._pitch_gain * barriers[0]
         names = (PITCH, *REGION, *[f"{SEPARATION}:{neighbour.drone}" for neighbour in neighbours])
         rows = Rows(names, coefficients, bounds, barriers)
-        return rows if self._airspace.is_open else self._with_zones(rows, predicted)
-
-    def _with_zones(self, rows: Rows, predicted: Floats) -> Rows:
-        found = self._airspace.barriers(predicted[:3], self._reach_m)
-        return Rows(
-            (*rows.names, *[f"{ZONE}:{name}" for name in found.names]),
-            np.concatenate([rows.coefficients, found.gradients]),
-            np.concatenate([rows.bounds, -self._gain * found.values_m]),
-            np.concatenate([rows.barriers, found.values_m]),
-        )
+        if not self._airspace.is_open:
+            zones = self._airspace.barriers(predicted[:3], self._reach_m)
+            labels = [f"{ZONE}:{name}" for name in zones.names]
+            rows = _joined(rows, labels, zones.gradients, -self._gain * zones.values_m, zones.values_m)
+        if self._obstacles is not None:
+            near = self._obstacles.rows(predicted[:3])
+            labels = [f"{OBSTACLE}:{k}" for k in range(len(near.bounds))]
+            rows = _joined(rows, labels, np.pad(near.normals, ((0, 0), (0, 2))), near.bounds, near.barriers)
+        return rows
 
     def _distance(self, neighbour: Neighbour) -> float:
         wide = widened_separation(self._flight, neighbour.error_m) if neighbour.error_m > 0 else self._wide
@@ -135,6 +141,15 @@ class Barriers:
         low = np.minimum(np.maximum(-self._speed, velocity - self._change), 0.0)
         high = np.maximum(np.minimum(self._speed, velocity + self._change), 0.0)
         return low, high
+
+
+def _joined(rows: Rows, names: Sequence[str], coefficients: Floats, bounds: Floats, barriers: Floats) -> Rows:
+    return Rows(
+        (*rows.names, *names),
+        np.concatenate([rows.coefficients, coefficients]),
+        np.concatenate([rows.bounds, bounds]),
+        np.concatenate([rows.barriers, barriers]),
+    )
 
 
 @njit(cache=True, nogil=True)

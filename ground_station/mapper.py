@@ -28,6 +28,7 @@ from protocol.field import VirtualField
 from protocol.geometry import Intrinsics
 from protocol.keyframe_rule import KeyframeRule
 from protocol.mission import Mission
+from protocol.obstacle_grid import Cells, ObstacleGrid
 
 log = logging.getLogger(__name__)
 
@@ -139,6 +140,10 @@ class Mapper:
         self._comparing_s += time.perf_counter() - began_s
         self._compared += 1
         return MapUpdate(mesh, change, self._score(mesh, LIVE_SAMPLES) if scored else None)
+
+    def free_cells(self, grid: ObstacleGrid) -> Cells:
+        """Which cells of ``grid`` were seen free by now."""
+        return self._reconstructor.free_cells(grid)
 
     @property
     def feedback_update_s(self) -> float | None:

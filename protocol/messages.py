@@ -67,6 +67,8 @@ class Tick(Message):
     """Keyframes sent before this tick."""
     aground: tuple[DroneId, ...] = ()
     """Drones that stand on the ground and will fly again: their states are waited for, but nothing is integrated."""
+    contacts: tuple[tuple[DroneId, Count], ...] = ()
+    """Of drones that have touched the simulated scene, how often they began to; to judge by, never to fly by."""
 
 
 class Setpoint(Message):
@@ -414,6 +416,16 @@ class MeshPage(Message):
     complete: bool
     """Whether there was nothing left to say."""
     blocks: tuple[MeshBlock, ...]
+
+
+class FreeCells(Message):
+    """Which cells the map has seen free (`protocol.obstacle_grid`), all of them anew each time."""
+
+    name: ClassVar[str] = "free_cells"
+    tick: TickNumber
+    """Takes effect at it."""
+    packed: bytes
+    """One bit a cell, x slowest, zlib."""
 
 
 class KeyframePage(Message):

@@ -16,6 +16,7 @@ from pydantic import Field, model_validator
 from protocol.battery_settings import Battery, battery_faults
 from protocol.geometry import Intrinsics
 from protocol.localization_settings import EstimateNoise, Lidar, Localization
+from protocol.obstacle_settings import Obstacles
 from protocol.operation_settings import Console, Metrics, Recording
 from protocol.planner_settings import PlannerName, Planners, planner_faults
 from protocol.separation import widened_separation
@@ -90,6 +91,7 @@ class Flight(Box):
     """[[x, y], ...] within the box, which drones do not leave at any height; left out: the box alone. docs/zones.md."""
     no_fly: Annotated[tuple[NoFly, ...], Field(max_length=ZONES_MAX)] = ()
     """What nobody enters."""
+    obstacles: Obstacles = Obstacles()
     clearance_m: Positive = 0.3
     """Distance of a drone's centre from boundary and zones: its radius, and what you want beside it; position_error_m
     and what lag adds come on top. The box itself is kept by the centre."""
@@ -319,6 +321,8 @@ class Simulation(Settings):
     """... and of its attitude. Independent from frame to frame; how the vehicles fly does not change."""
     estimate: EstimateNoise = EstimateNoise()
     battery: Battery = Battery()
+    vehicle_radius_m: Positive = 0.15
+    """Of the sphere that a vehicle is: where it touches the scene, that is counted."""
     start_patience_s: Positive = 120.0
     """How long the first tick waits for all drones; one that comes later joins in flight."""
 
@@ -446,6 +450,10 @@ class Mission(Settings):
             from protocol.free_space import start_faults
 
             faults += start_faults(self.flight, self.drones)
+        if self.flight.obstacles.enabled:
+            from protocol.obstacle_grid import obstacle_faults
+
+            faults += obstacle_faults(self)
         gain = self.controller.separation_gain_per_s * self.tick_s
         if gain > 0.5:
             faults.append(

@@ -115,6 +115,8 @@ GROUND_EVENT = Topic("ground/event", messages.Event, ("ground",), ("operator",),
                      "DATA_HIGH", 256, _NO_AGE, True, 16 * _KIB)
 MAP = Topic("map/blocks", messages.MeshPage, ("ground",), ("operator",),
             "BACKGROUND", 4, _NO_AGE, False, MAX_MESSAGE_BYTES, queryable=True)
+FREE = Topic("map/free", messages.FreeCells, ("ground",), ("agent",),
+             "DATA_HIGH", 16, _NO_AGE, False, 2 * _MIB)
 MAP_KEYFRAMES = Topic("map/keyframes", messages.KeyframePage, ("ground",), ("mapper",),
                       "DATA_LOW", 4, _NO_AGE, False, MAX_MESSAGE_BYTES, queryable=True)
 EXTERNAL_MESH = Topic("map/external", messages.ExternalMesh, ("mapper",), ("ground",),
@@ -125,7 +127,7 @@ STATUS = Topic("status", messages.Status, ("ground",), ("operator",),
 
 TOPICS: tuple[Topic[Message], ...] = (  # type: ignore[assignment]  # read-only use of an invariant generic
     STATE, TEAM, KEYFRAME, SETPOINT, SCAN, TICK, JUMP, HEAD, JOURNAL, DIGEST, BLOCKS, DRONE_BLOCKS, PHASE, COMMAND,
-    EVENT, GROUND_EVENT, MAP, MAP_KEYFRAMES, EXTERNAL_MESH, STATUS,
+    EVENT, GROUND_EVENT, MAP, FREE, MAP_KEYFRAMES, EXTERNAL_MESH, STATUS,
 )  # fmt: skip
 
 

@@ -186,6 +186,8 @@ def _told(mission: Mission, drone: int, plan: Plan) -> Iterator[tuple[Topic[Any]
     yield topics.HEAD, "down", rate_hz / HEAD_EVERY_TICKS, traffic_samples.head(), 0
     yield topics.PHASE, "down", 1 / PHASE_PERIOD_S, traffic_samples.phase(), 0
     yield topics.DIGEST, "down", 1 / mission.replication.digest_period_s, traffic_samples.digest(mission), 0
+    if mission.flight.obstacles.enabled:
+        yield topics.FREE, "down", 1 / mission.flight.obstacles.period_s, traffic_samples.free_cells(mission), 0
     if mission.feedback.method != "none" and mission.reconstruction.backend != "none":
         yield topics.JUMP, "down", 1 / mission.feedback.period_s, traffic_samples.jump(mission), 0
 

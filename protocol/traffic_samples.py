@@ -12,6 +12,7 @@ from protocol.field import VirtualField
 from protocol.messages import (
     Control,
     DroneState,
+    FreeCells,
     Jump,
     JumpHead,
     Keyframe,
@@ -26,6 +27,7 @@ from protocol.messages import (
     VehicleSample,
 )
 from protocol.mission import Mission
+from protocol.obstacle_grid import ObstacleGrid
 from protocol.team_states import pack
 
 TICK = 70_000
@@ -145,6 +147,13 @@ def phase() -> MissionPhase:
 def digest(mission: Mission) -> PhiDigest:
     count = BlockLayout(VirtualField.of(mission.target).shape).count
     return PhiDigest(epoch=EPOCH, tick=TICK, sketches=np.zeros((count, SKETCHES), np.float32))
+
+
+def free_cells(mission: Mission) -> FreeCells:
+    """Of a room that has been seen, and whose things are as rough as they get: no two columns end alike."""
+    grid = ObstacleGrid.of(mission)
+    tops = np.random.default_rng(0).integers(0, grid.shape[2], grid.shape[:2])
+    return FreeCells(tick=TICK, packed=grid.pack(np.arange(grid.shape[2]) >= tops[..., None]))
 
 
 def jump(mission: Mission) -> Jump:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from agents.barriers import Neighbour
+from agents.obstacles import Obstacles
 from agents.planners.planner import STAY, Decision
 from agents.planners.safety_filter import SafetyFilter
 from protocol.geometry import Floats
@@ -22,6 +23,9 @@ class FilteredPlanner(ABC):
         """``neighbours``: as many as are expected."""
         self._mission = mission
         self._filter = SafetyFilter(mission, neighbours)
+
+    def heed(self, obstacles: Obstacles) -> None:
+        self._filter.heed(obstacles)
 
     @abstractmethod
     def decide(

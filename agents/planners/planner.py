@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from agents.barriers import Neighbour, Rows
+from agents.obstacles import Obstacles
 from agents.quadratic_program import Outcome
 from protocol.geometry import Floats
 from protocol.importance import SamplingTerms
@@ -32,6 +33,10 @@ class Decision:
 
 class Planner(Protocol):
     """Every planner flies behind the same strict rows (`agents.planners.safety_filter`)."""
+
+    def heed(self, obstacles: Obstacles) -> None:
+        """There is a map of free cells, and it is kept up to date: what is not free is behind strict rows too."""
+        ...
 
     def note_team(self, drones: Sequence[int], poses: Floats) -> None:
         """One tick of phi was integrated with these ``drones``, ascending by id, at ``poses`` (drones, 5)."""

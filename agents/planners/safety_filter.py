@@ -9,7 +9,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from agents.barriers import FIXED_ROWS, SEPARATION, ZONE, Barriers, Neighbour, Rows, predicted_pose
+from agents.barriers import FIXED_ROWS, OBSTACLE, SEPARATION, ZONE, Barriers, Neighbour, Rows, predicted_pose
+from agents.obstacles import Obstacles
 from agents.planners.planner import STAY, Decision
 from agents.quadratic_program import NOTHING_HELD, Held, QuadraticProgram
 from protocol.airspace import airspace_of
@@ -22,6 +23,8 @@ WISH_WEIGHT = 1e3
 
 ZONE_ROWS = 6
 """Room for parts of zones that are near at once; where there are more, a larger program is set up, in a millisecond."""
+OBSTACLE_ROWS = 24
+"""Likewise for obstacles, and by how much the program grows."""
 
 
 class SafetyFilter:
@@ -31,6 +34,14 @@ class SafetyFilter:
         self._barriers = Barriers(mission)
         zones = 0 if airspace_of(mission.flight).is_open else ZONE_ROWS
         self._program = QuadraticProgram(FIXED_ROWS + neighbours + zones, mission.controller.effort_weight)
+        self._obstacles: Obstacles | None = None
+
+    def heed(self, obstacles: Obstacles) -> None:
+        """Rows of what is not free are strict as well from now on."""
+        self._obstacles = obstacles
+        self._barriers.heed(obstacles)
+        room = self._program.strict_rows + OBSTACLE_ROWS
+        self._program = QuadraticProgram(room, self._mission.controller.effort_weight)
 
     def solve(
         self,
@@ -52,7 +63,8 @@ class SafetyFilter:
         if (
             len(rows.names) > self._program.strict_rows
         ):  # more zones are near, or somebody not in the mission was heard of
-            self._program = QuadraticProgram(len(rows.names), settings.effort_weight)
+            room = len(rows.names) + (0 if self._obstacles is None else OBSTACLE_ROWS)
+            self._program = QuadraticProgram(room, settings.effort_weight)
         solution = self._program.solve(xi1, xi2, rows, low, high, held)
         if solution.outcome == "solved":
             return Decision(solution.velocity, "solved", solution.slack, sampling, rows, solution.active)
@@ -67,9 +79,9 @@ class SafetyFilter:
 
     def brake(self, rows: Rows, low: Floats, high: Floats) -> Floats:
         """Stop; or, where strict rows are broken already, undo that as fast as the vehicle can, unless another row
-        forbids it: away from the nearest neighbour first, else out of the zones, else back into the box and the
-        gimbal's range."""
-        for offset in [*self._from_others(rows), *self._out_of_zones(rows)]:
+        forbids it: away from the nearest neighbour first, else out of zones and obstacles, else back into the box and
+        the gimbal's range."""
+        for offset in [*self._from_others(rows), *self._out_of(rows, ZONE), *self._out_of(rows, OBSTACLE)]:
             retreat: Floats = np.clip(offset * top_speed(self._mission.flight), low, high)
             if _worsens_nothing(rows, retreat):
                 return retreat
@@ -86,9 +98,9 @@ class SafetyFilter:
         if separation and rows.barriers[separation].min() < 0:
             yield from _directions(rows, [separation[int(rows.barriers[separation].argmin())]])
 
-    def _out_of_zones(self, rows: Rows) -> Iterator[Floats]:
+    def _out_of(self, rows: Rows, kind: str) -> Iterator[Floats]:
         """Directions (5,) out of those that it is in: of all together, then of the deepest one, and so on."""
-        broken = [k for k in rows.of(ZONE) if rows.barriers[k] < 0]
+        broken = [k for k in rows.of(kind) if rows.barriers[k] < 0]
         yield from _directions(rows, broken)
         if len(broken) > 1:
             for k in sorted(broken, key=lambda k: rows.barriers[k]):

@@ -30,6 +30,8 @@ def in_words(row: str) -> str:
             return f"edge of the region ({what})"
         case "zone":
             return in_words_of_zone(what)
+        case "obstacle":
+            return "an obstacle, or what nobody has seen"
         case "pitch":
             return "range of the gimbal"
         case "bound" if what in BOUNDS:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ground_station.reconstruction.depth_check import COMPARED_MIN, NEAREST_M, Measured, fault_of
 from ground_station.reconstruction.depth_range import depth_range
+from ground_station.reconstruction.free_cells import seen_free
 from ground_station.reconstruction.fusion import Volume
 from ground_station.reconstruction.ledger import Ledger
 from ground_station.reconstruction.reconstructor import PATIENCE_S, Keyframe, Mesh, Outcome, State, Statistics
@@ -23,6 +24,7 @@ from ground_station.reconstruction.source_views import ViewIndex
 from ground_station.reconstruction.surface_nets import extract_mesh
 from ground_station.reconstruction.views import View, shrink, to_grey
 from protocol.mission import Mission
+from protocol.obstacle_grid import Cells, ObstacleGrid
 
 LOOK_AHEAD: Final = 1
 """Later keyframes of the same drone that a keyframe waits for."""
@@ -74,6 +76,9 @@ class DepthReconstructor:
 
     def mesh(self) -> Mesh:
         return extract_mesh(self._volume, WEIGHT_MIN)
+
+    def free_cells(self, grid: ObstacleGrid) -> Cells:
+        return seen_free(self._volume, WEIGHT_MIN, grid)
 
     def statistics(self) -> Statistics:
         kept = sum(BYTES_PER_PIXEL * entry.measured.depth.size for entry in self._kept if entry)

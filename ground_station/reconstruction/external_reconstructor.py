@@ -10,6 +10,7 @@ import numpy as np
 
 from ground_station.external_map import ExternalMap
 from ground_station.reconstruction.reconstructor import Keyframe, Mesh, Outcome, State, Statistics
+from protocol.obstacle_grid import Cells, ObstacleGrid
 
 WAITING_MAX: Final = 100_000
 """Keyframes without a map that has them; before more are, the oldest are given up: a process may be away for good."""
@@ -47,6 +48,10 @@ class ExternalReconstructor:
         mesh, _ = self._process.mesh_of(self._process.grow())
         self._decide()
         return Mesh(mesh.vertices.copy(), mesh.faces.copy(), mesh.colors.copy())
+
+    def free_cells(self, grid: ObstacleGrid) -> Cells:
+        """None: a mesh does not say what was seen free."""
+        return np.zeros(grid.shape, np.bool_)
 
     def statistics(self) -> Statistics:
         mesh, _ = self._process.newest

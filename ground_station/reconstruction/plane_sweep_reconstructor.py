@@ -20,6 +20,7 @@ from ground_station.reconstruction.admission import Admission
 from ground_station.reconstruction.consistency import agreements
 from ground_station.reconstruction.depth_map import DepthMap, make_estimator
 from ground_station.reconstruction.depth_range import DepthRange
+from ground_station.reconstruction.free_cells import seen_free
 from ground_station.reconstruction.fusion import Volume
 from ground_station.reconstruction.ledger import Ledger
 from ground_station.reconstruction.pose_refiner import Pose, PoseRefiner
@@ -28,6 +29,7 @@ from ground_station.reconstruction.source_views import ViewIndex
 from ground_station.reconstruction.surface_nets import extract_mesh
 from ground_station.reconstruction.views import View, shrink, to_grey
 from protocol.mission import Mission
+from protocol.obstacle_grid import Cells, ObstacleGrid
 
 LOOK_AHEAD: Final = 3
 """Later keyframes of the same drone that a keyframe waits for; 3 x 0.12 m is the widest useful baseline."""
@@ -106,6 +108,10 @@ class PlaneSweepReconstructor:
     def mesh(self) -> Mesh:
         self._fuse_due()
         return extract_mesh(self._volume, WEIGHT_MIN)
+
+    def free_cells(self, grid: ObstacleGrid) -> Cells:
+        self._fuse_due()
+        return seen_free(self._volume, WEIGHT_MIN, grid)
 
     def statistics(self) -> Statistics:
         kept = len(self._index) * self._width * self._height * BYTES_PER_PIXEL

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from protocol.errors import ReconstructionError
 from protocol.geometry import Floats, Intrinsics
+from protocol.obstacle_grid import Cells, ObstacleGrid
 
 ROTATION_TOLERANCE: Final = 1e-4
 """Largest error of an entry of R R^T: float32 on the wire leaves 1e-6."""
@@ -134,6 +135,11 @@ class Reconstructor(Protocol):
         """Of all that is decided by now; may be empty. The arrays are the caller's."""
         ...
 
+    def free_cells(self, grid: ObstacleGrid) -> Cells:
+        """[x, y, z] cells of ``grid`` that were seen free, by what is decided by now; none where a method cannot tell
+        free from unknown. The array is the caller's."""
+        ...
+
     def statistics(self) -> Statistics: ...
 
     @property
@@ -170,6 +176,9 @@ class NullReconstructor:
 
     def mesh(self) -> Mesh:
         return Mesh.empty()
+
+    def free_cells(self, grid: ObstacleGrid) -> Cells:
+        return np.zeros(grid.shape, np.bool_)
 
     def statistics(self) -> Statistics:
         return Statistics(self._received, self._received, 0, {}, 0)

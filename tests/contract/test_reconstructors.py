@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from deploy.examples.external_map import PlaneSweepMap
-from faults.boxes import BOXES, LEG, REFINED, fly_over, mission, share_right
+from faults.boxes import BOXES, LEG, NEAR_M, REFINED, fly_over, mission, share_right
 from faults.external_process import served
 from ground_station.reconstruction.backends import make_reconstructor
 from ground_station.reconstruction.learned.requirements import MODULES
@@ -20,6 +20,7 @@ from ground_station.reconstruction.reconstructor import Keyframe, Mesh, Outcome,
 from protocol.errors import ReconstructionError
 from protocol.geometry import Floats, Intrinsics, camera_rotation, turn_matrix
 from protocol.mission import Target
+from protocol.obstacle_grid import ObstacleGrid
 
 Make = Callable[[], Reconstructor]
 MAPPING = ("plane_sweep", "depth", "external")
@@ -497,3 +498,19 @@ def test_a_hovering_drone_does_not_keep_its_keyframes_waiting(flight: list[Keyfr
     reconstructor.add([late])
     outcomes = reconstructor.add([])
     assert {outcome.sequence for outcome in outcomes} == {0, 1, 2, 3}
+
+
+def test_what_was_seen_free_is_free(reconstructor: Reconstructor, flight: list[Keyframe], backend: str) -> None:
+    fly(reconstructor, flight)
+    grid = ObstacleGrid.of(mission(backend))
+    free = reconstructor.free_cells(grid)
+    if backend in ("external", "none"):
+        assert not free.any(), "who does not know what was seen free says nothing"
+        return
+    low = grid.origin + grid.cell_m * np.argwhere(free)
+    high = low + grid.cell_m
+    assert len(low) > 300
+    assert low[:, 2].min() > -NEAR_M
+    for lower, upper in BOXES:
+        within = (high > np.array(lower) + NEAR_M) & (low < np.array(upper) - NEAR_M)
+        assert not within.all(axis=1).any()

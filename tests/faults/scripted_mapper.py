@@ -12,6 +12,7 @@ from ground_station.mapper import MapState, MapUpdate
 from ground_station.reconstruction.reconstructor import Mesh
 from protocol import messages
 from protocol.field import VirtualField
+from protocol.obstacle_grid import Cells, ObstacleGrid
 
 MARK = np.float32(2.0**-6)
 """What each update adds at the marked positions: a power of two, whose sums float32 holds exactly."""
@@ -51,6 +52,10 @@ class ScriptedMapper:
         change = (dice.uniform(0.0, HIGHEST) * np.exp(-square / (2 * REACH_M**2))).astype(np.float32)
         change[self._marked] = MARK
         return MapUpdate(Mesh.empty(), change, None)
+
+    def free_cells(self, grid: ObstacleGrid) -> Cells:
+        """A script sees nothing."""
+        return np.zeros(grid.shape, np.bool_)
 
     def state(self) -> MapState:
         return MapState({"updates": np.array([self._updates], np.int32)}, first=0, end=0, unreadable=0)

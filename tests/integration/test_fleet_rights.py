@@ -49,6 +49,7 @@ FOREIGN_KEYS = (
     topics.JUMP.of(""),
     topics.HEAD.of(""),
     topics.DIGEST.of(""),
+    topics.FREE.of(""),
     topics.PHASE.of(""),
     topics.TICK.of(""),
     topics.STATUS.of(""),

@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 
 from ground_station.reconstruction.admission import Admission
+from ground_station.reconstruction.free_cells import seen_free
 from ground_station.reconstruction.fusion import Volume
 from ground_station.reconstruction.learned.fragment import (
     FINE_M,
@@ -34,6 +35,7 @@ from ground_station.reconstruction.reconstructor import PATIENCE_S, Keyframe, Me
 from ground_station.reconstruction.surface_nets import extract_mesh
 from ground_station.reconstruction.views import View, shrink, to_grey
 from protocol.mission import Mission
+from protocol.obstacle_grid import Cells, ObstacleGrid
 
 GROUP: Final = 4
 """Keyframes of one drone from which a fragment is made: half a metre of its path, a fifth of what a window shows."""
@@ -91,6 +93,9 @@ class LearnedReconstructor:
 
     def mesh(self) -> Mesh:
         return extract_mesh(self._volume, WEIGHT_MIN)
+
+    def free_cells(self, grid: ObstacleGrid) -> Cells:
+        return seen_free(self._volume, WEIGHT_MIN, grid)
 
     def statistics(self) -> Statistics:
         return self._ledger.statistics(
