@@ -35,6 +35,7 @@ class Outcome(Scores):
     jumps: int
     keyframes: int
     fallbacks: dict[str, int]
+    contacts: dict[str, int] | None = None
 
 
 def read_outcome(run: Path) -> Outcome:
@@ -57,6 +58,8 @@ def describe(outcome: Outcome, run: Path) -> Iterator[str]:
             yield f"F-score at 5 cm, {surface + ':':8} {score:.3f} (a bare floor: {floor:.3f})"
     if outcome.min_separation_m is not None:
         yield f"smallest separation {outcome.min_separation_m:.3f} m"
+    if outcome.contacts is not None:
+        yield f"{sum(outcome.contacts.values())} contacts with the scene"
     yield f"{outcome.keyframes} keyframes, {outcome.jumps} jumps, {sum(outcome.fallbacks.values())} ticks of braking"
     report = run / REPORT_FILE
     yield f"report: {report}" if report.is_file() else f"run folder: {run} (it holds no {REPORT_FILE})"

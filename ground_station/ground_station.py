@@ -24,6 +24,7 @@ from ground_station.keyframe_log import KEYFRAMES_FILE, KeyframeLog
 from ground_station.map_feedback import MapFeedback
 from ground_station.map_service import MapService
 from ground_station.mapper import Mapper, MapUpdate
+from ground_station.obstacle_publisher import ObstaclePublisher
 from ground_station.pose_errors import PoseErrors
 from ground_station.recording.recorder import RECORDING_FILE, Recorder, recording_path
 from ground_station.recovery import Recovery
@@ -85,10 +86,15 @@ class GroundStation:
         self._synchroniser = Synchroniser(bus, self._replication, rank=self._board.lost_states)
         self._jumps = JumpPublisher(bus, journal, self._replication)
         self._feedback = MapFeedback(mission, mapper, self._jumps, recorder, self._news.tell, lockstep=lockstep)
+        self._obstacles = None
+        if mission.flight.obstacles.enabled:
+            self._obstacles = ObstaclePublisher(mission, bus, mapper, self._feedback, lockstep=lockstep)
         self._recovery = Recovery(mission, bus, run, self._replication, self._jumps, self._feedback, mapper)
         self._clock = clock_of(mission, bus, lockstep=lockstep, now_s=asyncio.get_running_loop().time)
         self._lag = LoopLag()
         self._pose_errors = PoseErrors()
+        judged = mission.vehicles.kind == "simulated" and mission.simulation.scene
+        self._contacts = dict.fromkeys((drone.id for drone in mission.drones), 0) if judged else {}
         self._commands = CommandService(mission, bus, commands, phase=lambda: self._phase, changed=self._obey)
         waits = mission.start == "on_command" and not self._commands.started
         self._phase: Phase = "waiting" if waits else "starting"
@@ -134,6 +140,8 @@ class GroundStation:
             async with self._synchroniser.running():
                 await self._fly()
             await self._recovery.close()
+            if self._obstacles is not None:
+                self._obstacles.close()
             await self._finish()
             await self._see_them_home()
             await self._report()
@@ -161,6 +169,7 @@ class GroundStation:
     async def _step(self, tick: Tick) -> None:
         self._tick = self._news.tick = tick.tick
         self._pose_errors.hear(tick)
+        self._note_contacts(tick)
         if self._outdated:
             self._news.tell("error", "phi", f"{self._outdated}: a new epoch begins")
             await self._jumps.renew(self._outdated)
@@ -169,6 +178,9 @@ class GroundStation:
             self._news.tell("warning", "link", "going on without all states and keyframes: this run cannot be repeated")
         self._feedback.hand_over(tick.tick)
         await self._feedback.settle(tick.tick)
+        if self._obstacles is not None:
+            self._obstacles.look(tick.tick)
+            await self._obstacles.settle(tick.tick)
         steps = self._replication.integrate(tick.tick, self._bus.gone, self._wait_ticks)
         if self._replication.known:
             self._board.activity = ""
@@ -183,6 +195,12 @@ class GroundStation:
         for digest in self._replication.take_digests():
             self._bus.put(topics.DIGEST, digest)
         self._board.note_lives(self._bus.alive)
+
+    def _note_contacts(self, tick: Tick) -> None:
+        for drone, count in tick.contacts:
+            if count > self._contacts.get(drone, 0):
+                self._news.tell("error", "vehicle", f"drone {drone} touches the scene")
+            self._contacts[drone] = count
 
     def _is_complete(self, tick: Tick) -> bool:
         return self._feedback.received >= tick.keyframes and self._replication.is_ready(tick.tick, self._bus.gone)
@@ -330,6 +348,7 @@ class GroundStation:
             feedback_update_s=self._mapper.feedback_update_s,
             pose_errors=self._pose_errors.figures,
             unlocated=self._mapper.unlocated,
+            contacts=self._contacts or None,
         )
         self._recorder.metrics(final)
         self._recorder.finished(summary, mesh)

@@ -104,6 +104,8 @@ class Summary:
     """None where a simulator's drones know where they are, or nobody knows the truth."""
     unlocated: int = 0
     """Keyframes that were left out of the map because their poses were too bad."""
+    contacts: Mapping[int, int] | None = None
+    """How often each simulated vehicle began to touch the scene; None where no simulator tells."""
 
     def as_json(self) -> dict[str, Any]:
         """The content of summary.json: flat where runs are compared, ``null`` for what the run did not have."""
@@ -125,6 +127,7 @@ class Summary:
             "feedback_update_s": _rounded(self.feedback_update_s),
             **_pose_figures(self.pose_errors),
             "keyframes_unlocated": self.unlocated,
+            "contacts": None if self.contacts is None else {str(drone): n for drone, n in self.contacts.items()},
             "phi_sha256": self.phi_sha256,
             "mesh_sha256": self.mesh_sha256,
             "versions": dict(self.versions),
@@ -292,6 +295,7 @@ class RunFolder:
         feedback_update_s: float | None = None,
         pose_errors: PoseErrorFigures | None = None,
         unlocated: int = 0,
+        contacts: Mapping[int, int] | None = None,
     ) -> Summary:
         """Write the last checkpoint and the summary; the mesh must have been written before.
 
@@ -319,6 +323,7 @@ class RunFolder:
             feedback_update_s=feedback_update_s,
             pose_errors=pose_errors,
             unlocated=unlocated,
+            contacts=contacts,
         )
         text = json.dumps(summary.as_json(), indent=2, allow_nan=False) + "\n"
         self._replace(SUMMARY_FILE, text.encode())

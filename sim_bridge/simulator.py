@@ -33,6 +33,7 @@ from sim_bridge.roll_call import MissionWatch, wait_for_everybody
 from sim_bridge.scanner import Scanner
 
 if TYPE_CHECKING:
+    from sim_bridge.contacts import Contacts
     from sim_bridge.lidar import LidarSensor
     from sim_bridge.photographer import Photographer
 
@@ -56,9 +57,11 @@ class Simulator:
         bus: Bus,
         photographer: Photographer | None,
         lidar: LidarSensor | None = None,
+        contacts: Contacts | None = None,
         *,
         lockstep: bool,
     ) -> None:
+        """``contacts``: of a mission with a scene."""
         self._mission, self._bus, self._lockstep = mission, bus, lockstep
         self._darkroom = Darkroom(bus, photographer)
         self._bodies = {drone.id: VehicleBody.at(np.array(drone.start)) for drone in mission.drones}
@@ -67,6 +70,7 @@ class Simulator:
             drone: VehicleBattery(mission.simulation.battery, vehicles.battery_swap_s, vehicles.battery_spares)
             for drone in self._bodies
         }
+        self._contacts = contacts
         self._scanner = Scanner(bus, lidar, mission.scan_ticks)
         noise = mission.simulation.estimate
         self._errors = {
@@ -116,6 +120,8 @@ class Simulator:
         try:
             while not self._watch.is_over:
                 poses = {drone: body.pose for drone, body in self._bodies.items()}
+                if self._contacts is not None:
+                    self._contacts.note({drone: poses[drone] for drone in poses if not self._bodies[drone].landing})
                 if self._believed is not None:
                     self._believed.note_truth(self._tick, poses)
                 self._publish(self._beat())
@@ -185,6 +191,7 @@ class Simulator:
             next_jump=self._watch.head.next_sequence,
             keyframes=self._darkroom.sent,
             aground=tuple(self._aground()),
+            contacts=() if self._contacts is None else self._contacts.told,
         )
 
     def _sample(self, drone: int, body: VehicleBody) -> VehicleSample:
@@ -258,22 +265,23 @@ class Simulator:
 async def run_simulator(mission: Mission, link: Link, run: Path, *, lockstep: bool) -> None:
     """Simulate the world of ``mission``, or what its cameras see where autopilots fly; what is true of it is left in
     the run folder."""
-    photographer, lidar = await asyncio.to_thread(_make_sensors, mission, run)
+    photographer, lidar, contacts = await asyncio.to_thread(_make_sensors, mission, run)
     with MetricsEndpoint(mission, "sim"):
         async with connect(link, mission.name, lossless=lockstep) as bus:
             if mission.vehicles.kind == "px4":
                 await Observer(mission, bus, photographer).run()
             else:
-                await Simulator(mission, bus, photographer, lidar, lockstep=lockstep).run()
+                await Simulator(mission, bus, photographer, lidar, contacts, lockstep=lockstep).run()
 
 
-def _make_sensors(mission: Mission, run: Path) -> tuple[Photographer | None, LidarSensor | None]:
+def _make_sensors(mission: Mission, run: Path) -> tuple[Photographer | None, LidarSensor | None, Contacts | None]:
     """Load the scene, leave its truth in the run folder, and warm the camera up; None for a mission without a scene, or
     without a lidar."""
     if not mission.simulation.scene:
-        return None, None
+        return None, None, None
     # Heavy modules that a simulator without a scene does not need.
     from sim_bridge.camera import Camera
+    from sim_bridge.contacts import Contacts
     from sim_bridge.photographer import Photographer
     from sim_bridge.scenes.cache import scene_cache
     from sim_bridge.scenes.scene import load_scene
@@ -292,9 +300,10 @@ def _make_sensors(mission: Mission, run: Path) -> tuple[Photographer | None, Lid
     camera = Camera(scene, mission.camera.intrinsics())
     camera.render(mission.drones[0].start)
     depth_camera = Camera(scene, mission.sweep_intrinsics()) if mission.measures_depth else None
-    photographer = Photographer(mission, camera, depth_camera)
+    photographer, contacts = Photographer(mission, camera, depth_camera), Contacts(mission, scene.triangles)
+    contacts.rehearse(np.array(mission.drones[0].start))
     if mission.localization.source != "lidar":
-        return photographer, None
+        return photographer, None, contacts
     from sim_bridge.lidar import LidarSensor
 
-    return photographer, LidarSensor(scene, mission.lidar, mission.seed)
+    return photographer, LidarSensor(scene, mission.lidar, mission.seed), contacts
