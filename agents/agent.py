@@ -23,10 +23,12 @@ from prometheus_client import CollectorRegistry
 from agents.agent_metrics import AgentMetrics
 from agents.barriers import Neighbour, predicted_pose
 from agents.cameras.choice import make_feed
+from agents.climbing import Climbing
 from agents.energy import Reserve
 from agents.hearing import Hearing
 from agents.homing import Homecoming
 from agents.localization.choice import make_pose_source
+from agents.obstacles import Obstacles
 from agents.orders import Orders
 from agents.planners.choice import make_planner
 from agents.planners.planner import Decision
@@ -42,7 +44,18 @@ from protocol.clock import clock_of
 from protocol.errors import ProcessError
 from protocol.geometry import Floats
 from protocol.importance import SamplingTerms, compile_kernels
-from protocol.messages import Control, DroneOrder, DroneState, EventLevel, JumpHead, MissionPhase, Mode, Tick, Vector5
+from protocol.messages import (
+    Control,
+    DroneOrder,
+    DroneState,
+    EventLevel,
+    FreeCells,
+    JumpHead,
+    MissionPhase,
+    Mode,
+    Tick,
+    Vector5,
+)
 from protocol.metrics_endpoint import MetricsEndpoint
 from protocol.mission import Mission
 from protocol.news import News
@@ -101,7 +114,12 @@ class Agent:
         self._replication = Replication(mission, drone)
         self._synchroniser = Synchroniser(bus, self._replication, drone)
         self._planner = make_planner(mission, drone)
-        self._homecoming = Homecoming(mission, drone, self._planner)
+        self._obstacles = Obstacles(mission) if mission.flight.obstacles.enabled else None
+        self._climbing = None
+        if self._obstacles is not None:
+            self._planner.heed(self._obstacles)
+            self._climbing = Climbing(mission, self._obstacles)
+        self._homecoming = Homecoming(mission, drone, self._planner, self._obstacles)
         self._clock = clock_of(mission, bus, lockstep=lockstep, now_s=now_s)
         self._news = News(bus, topics.EVENT, f"drone/{drone}", drone)
         self._hearing = Hearing(mission, drone, bus, self._replication, self._team, self._news.tell, lockstep=lockstep)
@@ -126,7 +144,7 @@ class Agent:
         self._cells_at = -np.inf
         self._control: Control | None = None
         self._fallbacks = 0
-        self._ground_heard_s = now_s()
+        self._ground_heard_s = self._map_heard_s = now_s()
         self._landed_told = 0
         self._blind = False
         self._finished_s = math.inf
@@ -139,6 +157,8 @@ class Agent:
         bus.on(topics.HEAD, self._hear_head)
         bus.on(topics.DIGEST, self._replication.hear_digest)
         bus.on(topics.PHASE, self._hear_phase)
+        if self._obstacles is not None:
+            bus.on(topics.FREE, self._hear_free)
         bus.serve(topics.DRONE_BLOCKS, blocks_of(self._replication), drone)
         bus.watch_lives()
 
@@ -197,6 +217,11 @@ class Agent:
         self._ground_heard_s = self._now_s()
         self._replication.hear_head(head)
 
+    def _hear_free(self, cells: FreeCells) -> None:
+        self._map_heard_s = self._now_s()
+        if self._obstacles is not None:
+            self._obstacles.hear(cells)
+
     def _hear_phase(self, order: MissionPhase) -> None:
         self._ground_heard_s = self._now_s()
         for wanted in order.orders:
@@ -238,7 +263,7 @@ class Agent:
         if condition.authority != "ours":
             self._watchdog.feed()  # nothing is to be flown
             self._vehicle.pass_tick(tick.tick)
-            self._homecoming.put_off()
+            self._put_off()
             self._control = None
             if order.action == "land" and condition.authority == "starting":
                 self._vehicle.land()
@@ -259,7 +284,7 @@ class Agent:
         if not self._blind:
             self._news.tell("error", "vehicle", "no sound telemetry: braking")
             self._blind = True
-        self._homecoming.put_off()
+        self._put_off()
         self._vehicle.stop()
         if order.action == "land":
             self._vehicle.land()
@@ -274,8 +299,17 @@ class Agent:
             self._reserve.land()
         elif condition.authority == "ours" and telemetry is not None and self._is_sound(telemetry):
             self._reserve.look(telemetry)
+        map_silence = None
+        if self._obstacles is not None and not self._lockstep:
+            map_silence = (self._map_heard_s, self._now_s())
         order = self._orders.give(
-            telemetry, condition, silence, self._finished, self._operator.action, self._reserve.share
+            telemetry,
+            condition,
+            silence,
+            self._finished,
+            self._operator.action,
+            reserve=self._reserve.share,
+            map_silent_s=map_silence,
         )
         self._swap.note(order, stays=bool(self._finished) or self._operator.action in ("return", "land"))
         return order
@@ -285,7 +319,7 @@ class Agent:
         if not self._vehicle.make_ready():
             return condition
         self._swap.renew(telemetry.stamp_s)
-        self._homecoming = Homecoming(self._mission, self._drone, self._planner)
+        self._homecoming = Homecoming(self._mission, self._drone, self._planner, self._obstacles)
         return self._vehicle.condition()
 
     def _way_up_is_free(self, telemetry: Telemetry | None, tick: int) -> bool:
@@ -293,6 +327,12 @@ class Agent:
         if self._swap.count == 0:
             return True
         return telemetry is not None and self._swap.may_climb(telemetry, self._neighbours(telemetry, tick))
+
+    def _put_off(self) -> None:
+        """Something else than the planner, or nobody here, flies now."""
+        self._homecoming.put_off()
+        if self._climbing is not None:
+            self._climbing.put_off()
 
     def _publish(self, telemetry: Telemetry, tick: int, mode: Mode, blind_s: float = 0.0) -> None:
         state = self._state_of(telemetry, tick, mode, blind_s)
@@ -306,9 +346,8 @@ class Agent:
 
     async def _advance(self, tick: Tick) -> SamplingTerms:
         """Bring phi forward; the sampling terms at the own pose."""
-        ready = self._replication.is_ready
         if self._lockstep:
-            await self._bus.until(lambda: bool(self._finished) or ready(tick.tick, self._bus.gone), LOCKSTEP_PATIENCE_S)
+            await self._bus.until(lambda: bool(self._finished) or self._is_ready(tick.tick), LOCKSTEP_PATIENCE_S)
         steps = self._replication.integrate(tick.tick, self._bus.gone, self._wait_ticks)
         for step in steps:
             self._planner.note_team(step.ids, step.poses)
@@ -316,20 +355,35 @@ class Agent:
             return steps[-1].terms
         return self._replication.terms()
 
+    def _is_ready(self, tick: int) -> bool:
+        gone = self._bus.gone
+        mapped = self._obstacles is None or self._obstacles.is_ready(tick) or "ground" in gone
+        return mapped and self._replication.is_ready(tick, gone)
+
     def _decide(self, telemetry: Telemetry, tick: Tick, mode: Mode, terms: SamplingTerms) -> Decision:
         neighbours = self._neighbours(telemetry, tick.tick)
+        if self._obstacles is not None:
+            self._obstacles.advance(tick.tick, telemetry.position_sd_m)
         if mode in ("returning", "landing"):
             return self._homecoming.steer(
                 telemetry.pose, telemetry.velocity, neighbours, home=mode == "returning", now_s=self._clock.now_s()
             )
-        self._homecoming.put_off()
         if mode in ("joining", "holding"):
+            self._put_off()
             return self._planner.steer(telemetry.pose, telemetry.velocity, neighbours)
+        self._homecoming.put_off()
+        if self._climbing is not None:
+            wish = self._climbing.wish(telemetry.pose[:3], tick.time_s)
+            if wish is not None:
+                return self._planner.steer(telemetry.pose, telemetry.velocity, neighbours, wish)
         if tick.time_s - self._cells_at >= SHARE_PERIOD_S:
             row, poses = self._replication.newest()
             self._cells = float(self._replication.replica.field.owned_cells(poses)[row])
             self._cells_at = tick.time_s
-        return self._planner.decide(telemetry.pose, telemetry.velocity, neighbours, terms, self._cells)
+        decision = self._planner.decide(telemetry.pose, telemetry.velocity, neighbours, terms, self._cells)
+        if self._climbing is not None:
+            self._climbing.look(telemetry.pose[:3], decision, tick.time_s)
+        return decision
 
     def _neighbours(self, telemetry: Telemetry, tick: int) -> list[Neighbour]:
         height_m = float(predicted_pose(telemetry.pose, telemetry.velocity, self._mission.flight)[2])
@@ -395,7 +449,7 @@ class Agent:
             sampling=decision.sampling,
             solve_s=solve_s,
             separation_margin_m2=rows.margin("separation", UNLIMITED),
-            region_margin_m=min(rows.margin("region", UNLIMITED), rows.margin("zone", UNLIMITED)),
+            region_margin_m=min(rows.margin(kind, UNLIMITED) for kind in ("region", "zone", "obstacle")),
             pitch_margin_rad2=rows.margin("pitch", UNLIMITED),
             active=decision.active,
             fallbacks=self._fallbacks,
@@ -407,7 +461,10 @@ class Agent:
 async def run_agent(mission: Mission, drone: int, link: Link, *, lockstep: bool) -> None:
     """Fly one drone of ``mission`` until it ends."""
     compile_kernels()
-    make_planner(mission, drone).rehearse()
+    planner = make_planner(mission, drone)
+    if mission.flight.obstacles.enabled:
+        planner.heed(Obstacles(mission))
+    planner.rehearse()
     with MetricsEndpoint(mission, "agent", drone) as served:
         metrics = AgentMetrics(served.registry)
         async with connect(link, mission.name, lossless=lockstep) as bus:

@@ -1,8 +1,8 @@
 """Home, and down: where a drone wants to go when it no longer covers. Wishes only: the strict rows decide.
 
-Three rules keep wishes from ending in a stalemate, which strict rows alone would hold for ever: who meets somebody on
-the way keeps to the right, nobody comes down above another, and around zones one goes by their corners, as
-`agents.pathway` says.
+Four rules keep wishes from ending in a stalemate, which strict rows alone would hold for ever: who meets somebody on
+the way keeps to the right, nobody comes down above another, around zones one goes by their corners, as
+`agents.pathway` says, and out of a room with obstacles up to where nothing stands, as `agents.way_up` does.
 """
 
 from __future__ import annotations
@@ -14,8 +14,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from agents.barriers import Neighbour
+from agents.climbing import towards
+from agents.obstacles import Obstacles
 from agents.pathway import Pathway
 from agents.planners.planner import Decision, Planner
+from agents.way_up import WayUp
 from protocol.geometry import Floats
 from protocol.mission import Mission
 
@@ -40,9 +43,11 @@ log = logging.getLogger(__name__)
 class Homecoming:
     """Brings one drone down, at home or where it is, and notices when there is no way."""
 
-    def __init__(self, mission: Mission, drone: int, planner: Planner) -> None:
+    def __init__(self, mission: Mission, drone: int, planner: Planner, obstacles: Obstacles | None = None) -> None:
+        """``obstacles``: those that the planner heeds."""
         self._flight, self._home, self._planner = mission.flight, mission.drone(drone).start, planner
         self._pathway = Pathway(mission.flight)
+        self._way_up = None if obstacles is None else WayUp(obstacles)
         self._left_m = math.inf
         """Way to go, the least so far ..."""
         self._nearer_s = 0.0
@@ -55,8 +60,14 @@ class Homecoming:
     ) -> Decision:
         """``pose`` and ``velocity`` (5,); ``home``: at the start's place instead of here."""
         distance, speed = self._flight.estimated_separation_m, self._flight.speed_max_mps
-        leg = self._pathway.leg(pose[:3], np.array(self._home[:2]) if home else None)
-        if leg is not None:
+        away_m = math.dist(pose[:2], self._home[:2]) if home else 0.0
+        ascent = self._way_up.ascent(pose[:3]) if self._way_up is not None and away_m > ARRIVED_M else None
+        leg = None
+        if ascent is None:
+            leg = self._pathway.leg(pose[:3], np.array(self._home[:2]) if home else None)
+        if ascent is not None:
+            wish = towards(pose[:3], ascent.end, speed)
+        elif leg is not None:
             wish = leg_wish(pose, leg.end, neighbours, distance, speed)
         elif home:
             wish = home_wish(pose, self._home, neighbours, distance, speed)
@@ -64,10 +75,13 @@ class Homecoming:
             wish = down_wish(pose, neighbours, distance, speed)
         decision = self._planner.steer(pose, velocity, neighbours, wish)
         height = float(pose[2]) - self._flight.lower_m[2]
-        self.landing = self.landing or bool(leg is None and height < TOUCHDOWN_M and wish[2] < 0)
-        left_m = height + (math.dist(pose[:2], self._home[:2]) if home else 0.0)
+        down = ascent is None and leg is None
+        self.landing = self.landing or bool(down and height < TOUCHDOWN_M and wish[2] < 0)
+        left_m = height + away_m
         if leg is not None:
             left_m = leg.left_m
+        elif ascent is not None:
+            left_m = 2 * ascent.left_m + left_m
         if left_m < self._left_m - NEARER_M:
             self._left_m, self._nearer_s = left_m, now_s
         elif now_s - self._nearer_s > STUCK_S and not self.landing and not _below(pose, neighbours, distance):

@@ -21,6 +21,7 @@ class Orders:
         self._flight, self._now_s, self._tell = mission.flight, now_s, tell
         self._policies = Policies(mission)
         self._telemetry_silence, self._ground_silence = WitnessedSilence(), WitnessedSilence()
+        self._map_silence = WitnessedSilence()
         self._starting_since_s = math.inf
         self._jumps, self._jumped_at_s = 0, -math.inf
         self._deviation_max_m = mission.localization.deviation_max_m
@@ -40,10 +41,12 @@ class Orders:
         finished: str,
         operator: Wish,
         reserve: float = 0.0,
+        map_silent_s: tuple[float, float] | None = None,
     ) -> Order:
         """``ground_silent_s``: when the ground station was heard last, and now; None where its silence does not matter.
         ``finished``: why the mission is over; empty while it is not. ``operator``: what one ordered last. ``reserve``:
-        share of the battery that the way home takes."""
+        share of the battery that the way home takes. ``map_silent_s``: like the ground station's, of its maps of free
+        cells; None where there are none."""
         now_s = self._now_s()
         if condition.authority != "starting":
             self._starting_since_s = now_s
@@ -65,6 +68,7 @@ class Orders:
             unsure_s=now_s - self._sure_at_s,
             gimbal_lost=condition.gimbal_lost,
             ground_away_s=0.0 if ground_silent_s is None else self._ground_silence.look(*ground_silent_s),
+            map_age_s=0.0 if map_silent_s is None else self._map_silence.look(*map_silent_s),
             finished=finished,
             operator=operator,
         )

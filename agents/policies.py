@@ -56,6 +56,8 @@ class Situation:
     gimbal_lost: bool = False
     ground_away_s: float = 0.0
     """Since the ground station was heard last; always 0 in lockstep, which waits instead."""
+    map_age_s: float = 0.0
+    """Since a map of free cells was heard last; always 0 in lockstep, and without obstacles."""
     finished: str = ""
     """Why the mission is over; empty while it is not."""
     operator: Wish = "fly"
@@ -225,6 +227,15 @@ POLICIES: tuple[Policy, ...] = (
         action=lambda mission: mission.replication.ground_lost,
         then="hold or land, by `replication.ground_lost`, until it is back",
         reason=lambda now: f"no ground station for {now.ground_away_s:.0f} s",
+    ),
+    Policy(
+        "obstacle map stale",
+        "no map of free cells for `flight.obstacles.stale_s`, where `flight.obstacles.enabled`",
+        judged=_OURS,
+        holds=lambda mission, now: now.map_age_s > mission.flight.obstacles.stale_s,
+        action=lambda _mission: "hold",
+        then="hold until one comes; what was seen free stays free, so a return goes on",
+        reason=lambda _now: "no map of free cells",
     ),
     Policy(
         "operator: pause",
