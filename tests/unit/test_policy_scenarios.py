@@ -9,13 +9,18 @@ import pytest
 
 from agents.policies import policy_table
 
-SCENARIOS = (Path("tests/scenario/test_px4_failures.py"), Path("tests/scenario/test_localization.py"))
+SCENARIOS = (
+    Path("tests/scenario/test_px4_failures.py"),
+    Path("tests/scenario/test_localization.py"),
+    Path("tests/scenario/test_obstacle_flight.py"),
+)
 
 BATTERIES = "test_batteries_a_gimbal_and_a_pilot"
 TELEMETRY = "test_telemetry_an_estimate_a_fence_and_a_refusal"
 PROCESSES = "test_an_agent_stopped_one_killed_and_the_ground_station_lost"
 OPERATOR = "test_an_operator_pauses_returns_and_lands_drones"
 LOST = "test_drones_that_no_longer_know_where_they_are_hold_and_then_land"
+STALE = "test_drones_hold_while_no_map_of_free_cells_comes"
 CUT = "test_the_others_fly_on_and_land_when_a_link_is_cut_for_good"
 
 SHOWN_BY = {
@@ -33,6 +38,7 @@ SHOWN_BY = {
     "telemetry stale": TELEMETRY,
     "estimate jumped": TELEMETRY,
     "not ours yet": TELEMETRY,
+    "obstacle map stale": STALE,
     "operator: land": OPERATOR,
     "operator: return": OPERATOR,
     "operator: pause": OPERATOR,
