@@ -38,6 +38,7 @@ from agents.team import Team
 from agents.vehicles.choice import make_vehicle
 from agents.vehicles.vehicle import Condition, Telemetry
 from agents.watchdog import Watchdog
+from agents.way_up import WayUp
 from protocol import topics
 from protocol.bus import Bus, connect
 from protocol.clock import clock_of
@@ -449,7 +450,7 @@ class Agent:
             sampling=decision.sampling,
             solve_s=solve_s,
             separation_margin_m2=rows.margin("separation", UNLIMITED),
-            region_margin_m=min(rows.margin(kind, UNLIMITED) for kind in ("region", "zone", "obstacle")),
+            region_margin_m=min(rows.margin("region", UNLIMITED), rows.margin("zone", UNLIMITED)),
             pitch_margin_rad2=rows.margin("pitch", UNLIMITED),
             active=decision.active,
             fallbacks=self._fallbacks,
@@ -463,7 +464,9 @@ async def run_agent(mission: Mission, drone: int, link: Link, *, lockstep: bool)
     compile_kernels()
     planner = make_planner(mission, drone)
     if mission.flight.obstacles.enabled:
-        planner.heed(Obstacles(mission))
+        obstacles = Obstacles(mission)
+        planner.heed(obstacles)
+        WayUp(obstacles).rehearse()
     planner.rehearse()
     with MetricsEndpoint(mission, "agent", drone) as served:
         metrics = AgentMetrics(served.registry)

@@ -44,6 +44,8 @@ class Obstacles:
         self._speed = top_speed(flight)
         self._waiting: deque[FreeCells] = deque(maxlen=QUEUE)
         self._heard = 0
+        self._joined = -1
+        """Tick from which on maps are waited for."""
         self._deviation_m = 0.0
         self.free = self.grid.vouched
         """[x, y, z]; replaced as a whole."""
@@ -59,17 +61,20 @@ class Obstacles:
         self._waiting.append(message)
 
     def is_ready(self, tick: int) -> bool:
-        """Whether the map that takes effect by ``tick`` has come; in lockstep it always comes."""
-        return self._heard >= tick // self._period * self._period
+        """Whether the map that takes effect by ``tick`` has come; in lockstep it always comes, but to a drone that
+        joins in flight those that were told before."""
+        if self._joined < 0:
+            self._joined = tick
+        due = tick // self._period * self._period
+        return due <= self._joined or self._heard >= due
 
     def advance(self, tick: int, deviation_m: float = 0.0) -> None:
         """Take the newest map that is in effect at ``tick``. ``deviation_m``: of the own position."""
-        due = None
-        while self._waiting and self._waiting[0].tick <= tick:
-            due = self._waiting.popleft()
-        if due is not None:
+        due = [message for message in self._waiting if message.tick <= tick]
+        if due:
+            self._waiting = deque((message for message in self._waiting if message.tick > tick), QUEUE)
             try:
-                self.free = self.grid.unpack(due.packed) | self.grid.vouched
+                self.free = self.grid.unpack(due[-1].packed) | self.grid.vouched
             except MessageError:
                 self.refused += 1
         if deviation_m != self._deviation_m:

@@ -230,7 +230,7 @@ POLICIES: tuple[Policy, ...] = (
     ),
     Policy(
         "obstacle map stale",
-        "no map of free cells for `flight.obstacles.stale_s`, where `flight.obstacles.enabled`",
+        "no map of free cells for the stale_s of `flight.obstacles`, where they are enabled",
         judged=_OURS,
         holds=lambda mission, now: now.map_age_s > mission.flight.obstacles.stale_s,
         action=lambda _mission: "hold",

@@ -39,6 +39,10 @@ class WayUp:
         """The map that the steps are of."""
         self._steps: NDArray[np.int32] = np.empty((0, 0, 0), np.int32)
 
+    def rehearse(self) -> None:
+        """Search once, so that nothing is left to be compiled in flight."""
+        _follow(_search(self._obstacles), np.zeros(3, np.int64), SEARCH_CELLS, AHEAD_CELLS)
+
     def ascent(self, place: Floats) -> Ascent | None:
         """From ``place`` (3,); None where nothing is in the way any more. Straight up where no way is known."""
         obstacles, grid = self._obstacles, self._obstacles.grid

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from agents.barriers import Neighbour, predicted_pose
+from agents.homing import Homecoming
 from agents.planners.choice import make_planner
 from protocol.field import VirtualField
 from protocol.importance import ImportanceField
@@ -83,3 +85,25 @@ class TeamFlight:
     def _note_separation(self, poses: np.ndarray) -> None:
         for one, other in itertools.combinations(poses[:, :3], 2):
             self.min_separation = min(self.min_separation, math.dist(one, other))
+
+    def bring_home(self, homecomings: Sequence[Homecoming], ticks: int) -> Iterator[int]:
+        """Everybody returns and lands, the vehicles' own landing left out; yields each tick's number until all would.
+
+        Raises:
+            AssertionError: somebody is still on the way after ``ticks``.
+        """
+        dt, flight = self.mission.tick_s, self.mission.flight
+        for tick in range(ticks):
+            predicted = [predicted_pose(body.pose, body.velocity, flight) for body in self.bodies]
+            for row, (homecoming, body) in enumerate(zip(homecomings, self.bodies, strict=True)):
+                others = [Neighbour(k + 1, place[:3], 0.0) for k, place in enumerate(predicted) if k != row]
+                decision = homecoming.steer(body.pose, body.velocity, others, home=True, now_s=tick * dt)
+                velocity = np.zeros(5) if homecoming.landing else decision.velocity
+                body.command(velocity, tick * dt, flight)
+            for body in self.bodies:
+                body.step(dt, tick * dt, flight)
+            self._note_separation(np.array([body.pose for body in self.bodies]))
+            yield tick
+            if all(homecoming.landing for homecoming in homecomings):
+                return
+        raise AssertionError("still in the air")

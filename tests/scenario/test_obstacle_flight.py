@@ -14,7 +14,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from agents.agent import Agent
-from agents.barriers import Neighbour, predicted_pose
 from agents.climbing import CLIMB_S
 from agents.homing import Homecoming
 from agents.obstacles import Obstacles
@@ -54,23 +53,14 @@ def test_two_drones_go_down_into_a_room_as_they_see_it_and_come_home() -> None:
 
 def _bring_home(flight: RoomFlight) -> None:
     """From below the height of things to above the starts, and down as far as is known to be free."""
-    mission, dt = flight.mission, flight.mission.tick_s
+    mission = flight.mission
     homecomings = [
         Homecoming(mission, drone.id, planner, obstacles)
         for drone, planner, obstacles in zip(mission.drones, flight.planners, flight.obstacles, strict=True)
     ]
-    for tick in range(900):
-        predicted = [predicted_pose(body.pose, body.velocity, mission.flight) for body in flight.bodies]
-        for row, (homecoming, body) in enumerate(zip(homecomings, flight.bodies, strict=True)):
-            others = [Neighbour(k + 1, place[:3], 0.0) for k, place in enumerate(predicted) if k != row]
-            decision = homecoming.steer(body.pose, body.velocity, others, home=True, now_s=tick * dt)
-            velocity = np.zeros(5) if homecoming.landing else decision.velocity
-            body.command(velocity, tick * dt, mission.flight)
-        for body in flight.bodies:
-            body.step(dt, tick * dt, mission.flight)
-            assert not_free(flight.grid, flight.obstacles[0].free, body.pose[:3]) >= mission.flight.clearance_m
-        if all(homecoming.landing for homecoming in homecomings):
-            break
+    for _ in flight.bring_home(homecomings, 900):
+        for body, obstacles in zip(flight.bodies, flight.obstacles, strict=True):
+            assert not_free(flight.grid, obstacles.free, body.pose[:3]) >= mission.flight.clearance_m
     for body, drone in zip(flight.bodies, mission.drones, strict=True):
         assert math.dist(body.pose[:2], drone.start[:2]) < 0.3
 

@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 from typing import get_args
 
-import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from agents.barriers import Neighbour, predicted_pose
 from agents.homing import Homecoming
 from faults.team_flight import TeamFlight
 from faults.zones import distance_m, l_shaped, random_flight, starts
@@ -54,26 +52,11 @@ def test_three_drones_map_an_l_with_two_zones_and_come_home() -> None:
 
 def _bring_home(flight: TeamFlight) -> float:
     """Everybody returns and lands; the smallest distance from a zone on the way."""
-    mission, dt = flight.mission, flight.mission.tick_s
     homecomings = [
-        Homecoming(mission, drone.id, planner) for drone, planner in zip(mission.drones, flight.planners, strict=True)
+        Homecoming(flight.mission, drone.id, planner)
+        for drone, planner in zip(flight.mission.drones, flight.planners, strict=True)
     ]
-    nearest = math.inf
-    for tick in range(1600):
-        predicted = [predicted_pose(body.pose, body.velocity, mission.flight) for body in flight.bodies]
-        for row, (homecoming, body) in enumerate(zip(homecomings, flight.bodies, strict=True)):
-            others = [Neighbour(k + 1, place[:3], 0.0) for k, place in enumerate(predicted) if k != row]
-            decision = homecoming.steer(body.pose, body.velocity, others, home=True, now_s=tick * dt)
-            velocity = np.zeros(5) if homecoming.landing else decision.velocity
-            body.command(velocity, tick * dt, mission.flight)
-        for body in flight.bodies:
-            body.step(dt, tick * dt, mission.flight)
-        flight._note_separation(np.array([body.pose for body in flight.bodies]))
-        if tick % CHECK_EVERY == 0:
-            nearest = min(nearest, nearest_m(flight))
-        if all(homecoming.landing for homecoming in homecomings):
-            return nearest
-    raise AssertionError("still in the air")
+    return min(nearest_m(flight) for tick in flight.bring_home(homecomings, 1600) if tick % CHECK_EVERY == 0)
 
 
 @pytest.mark.parametrize("planner", get_args(PlannerName))

@@ -155,6 +155,10 @@ def test_a_map_takes_effect_at_its_tick_and_one_of_another_room_never() -> None:
     assert obstacles.is_ready(39)
     assert not obstacles.is_ready(40), "one is due every ten ticks"
 
+    late = Obstacles(room_mission())
+    assert late.is_ready(35), "what was told before it joined never comes to it"
+    assert not late.is_ready(40)
+
     obstacles.advance(29)
     assert np.array_equal(obstacles.free, grid.vouched)
     obstacles.advance(30)

@@ -52,6 +52,7 @@ IN_FLIGHT: dict[str, tuple[dict[str, Any], dict[str, Any], Action]] = {
     "battery reserve": ({"reserve": 1.0}, {"reserve": 1.0 - BIT}, "return"),
     "gimbal lost": ({"gimbal_lost": True}, {"gimbal_lost": False}, "return"),
     "ground station lost": ({"ground_away_s": 60.0 + BIT}, {"ground_away_s": 60.0}, "hold"),
+    "obstacle map stale": ({"map_age_s": 5.0 + BIT}, {"map_age_s": 5.0}, "hold"),
     "operator: pause": ({"operator": "hold"}, {"operator": "fly"}, "hold"),
     "telemetry stale": ({"telemetry_age_s": 0.5 + BIT}, {"telemetry_age_s": 0.5}, "hold"),
     "estimate jumped": (
@@ -142,6 +143,7 @@ def test_who_flies_decides_alone_what_may_be_ordered(authority: Authority) -> No
         (bad("gimbal lost"), "the gimbal does not obey"),
         (bad("ground station lost"), "no ground station for 60 s"),
         (bad("estimate jumped"), "the position estimate jumped"),
+        (bad("obstacle map stale"), "no map of free cells"),
     ],
 )
 def test_an_order_says_why(situation: Situation, reason: str) -> None:

@@ -65,7 +65,7 @@ def fly(run: RunFolder, first: int, last: int) -> None:
 def finish(run: RunFolder, tick: int = 10) -> dict[str, object]:
     run.finish(
         metrics(tick), floor_baseline=FLOOR, phi_sha256="f" * 64, wall_time_s=2.5, exit_reason="duration",
-        feedback_update_s=0.0123, unlocated=5,
+        feedback_update_s=0.0123, unlocated=5, contacts={1: 0, 4: 2},
         pose_errors=PoseErrorFigures(rms_m=0.02, max_m=0.05, final_m=0.01, yaw_rms_rad=0.003, beyond=0.001),
     )  # fmt: skip
     content: dict[str, object] = json.loads((run.path / "summary.json").read_text())
@@ -145,7 +145,7 @@ def test_the_summary_holds_every_figure_by_which_runs_are_compared(folder: RunFo
         "min_separation_m": 2.91, "jumps": 3, "keyframes": 42, "fallbacks": {"1": 0, "4": 3}, "ticks": 10,
         "sim_time_s": 0.5, "wall_time_s": 2.5, "feedback_update_s": 0.0123,
         "pose_error_rms_m": 0.02, "pose_error_max_m": 0.05, "pose_error_final_m": 0.01, "pose_error_yaw_rms_rad": 0.003,
-        "pose_error_beyond": 0.001, "keyframes_unlocated": 5,
+        "pose_error_beyond": 0.001, "keyframes_unlocated": 5, "contacts": {"1": 0, "4": 2},
         "phi_sha256": "f" * 64, "mesh_sha256": mesh_sha256(VERTICES, FACES),
     }  # fmt: skip
     assert isinstance(baseline, dict)

@@ -34,6 +34,10 @@ def least_distance_m(flight: Flight, way: list[Floats]) -> float:
     return min(distance_m(flight, point) for point in legs)
 
 
+def test_within_a_convex_boundary_every_way_is_straight() -> None:
+    assert routes_of(Flight(boundary=((-3.5, -3.5), (3.5, -3.5), (3.5, 3.5), (-3.5, 3.5)))) is None
+
+
 def test_without_zones_there_is_nothing_to_ask() -> None:
     assert routes_of(Flight()) is None
     assert Pathway(Flight()).leg(np.zeros(3), np.ones(2)) is None

@@ -19,6 +19,7 @@ from protocol.keyframe_rule import KeyframeRule
 from protocol.localization_settings import Localization
 from protocol.mission import Camera, Drone, Flight, Mission
 from protocol.mission_file import mission_to_toml
+from protocol.obstacle_settings import Obstacles
 from protocol.topics import TOPICS
 from protocol.traffic import (
     HEAD_EVERY_TICKS,
@@ -45,6 +46,10 @@ def team(count: int, **settings: Any) -> Mission:
     return Mission(flight=WIDE, drones=drones, **settings)
 
 
+def with_obstacles() -> Mission:
+    return Mission(flight=Flight(obstacles=Obstacles(enabled=True)), drones=team(1).drones)
+
+
 def with_camera(count: int) -> Mission:
     mission = team(count, vehicles=Vehicles(kind="px4"))
     seeing = mission.drones[0].model_copy(update={"camera": "/dev/video0"})
@@ -57,7 +62,13 @@ def with_camera(count: int) -> Mission:
 def test_every_topic_of_an_agent_is_planned_or_known_to_be_irregular() -> None:
     planned = {
         (flow.topic, flow.direction)
-        for mission in (team(4), team(9), with_camera(2), team(1, localization=Localization(source="lidar")))
+        for mission in (
+            team(4),
+            team(9),
+            with_camera(2),
+            with_obstacles(),
+            team(1, localization=Localization(source="lidar")),
+        )
         for flow in traffic_of(mission, 1).flows
     }
     regular = [topic for topic in TOPICS if topic not in IRREGULAR]

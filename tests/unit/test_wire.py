@@ -22,6 +22,7 @@ from protocol.messages import (
     DroneStatus,
     Event,
     ExternalMesh,
+    FreeCells,
     JournalPage,
     Jump,
     JumpHead,
@@ -92,6 +93,7 @@ EXAMPLES: tuple[Message, ...] = (
         jump_epoch=2**62,
         next_jump=4,
         keyframes=5,
+        contacts=((7, 2),),
     ),
     Setpoint(drone=255, tick=12, velocity=(0.5, -0.5, 0.0, 0.5, -0.5), land=True),
     CONTROL,
@@ -131,6 +133,7 @@ EXAMPLES: tuple[Message, ...] = (
     Event(source="drone/3", tick=12, level="warning", kind="order", text="land: battery critical (battery at 9%)"),
     MESH_BLOCK,
     MeshPage(epoch=7, revision=3, complete=False, blocks=(MESH_BLOCK,)),
+    FreeCells(tick=40, packed=b"\x00\xff"),
     KeyframePage(epoch=7, first=12, next=40, keyframes=(b"\x00one", b"two"), wanted=True),
     ExternalMesh(
         epoch=7,
