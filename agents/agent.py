@@ -263,21 +263,21 @@ class Agent:
         terms = await self._advance(tick)
         if condition.authority != "ours":
             self._watchdog.feed()  # nothing is to be flown
+            if order.action == "land" and condition.authority == "starting":
+                self._vehicle.land()
             self._vehicle.pass_tick(tick.tick)
             self._put_off()
             self._control = None
-            if order.action == "land" and condition.authority == "starting":
-                self._vehicle.land()
             return
 
         age_s = max(0.0, self._clock.now_s() - telemetry.stamp_s)
         began = time.perf_counter()
         decision = self._decide(telemetry, tick, mode, terms)
         solve_s = time.perf_counter() - began
+        if self._homecoming.landing:
+            self._vehicle.land()  # before the answer to this tick, on which a simulator in lockstep goes on
         sent = self._vehicle.send(tick.tick, decision.velocity)
         self._watchdog.feed()
-        if self._homecoming.landing:
-            self._vehicle.land()
         self._report(tick.tick, decision, sent, solve_s, age_s)
 
     def _step_blindly(self, telemetry: Telemetry | None, tick: Tick, order: Order) -> None:
