@@ -65,6 +65,8 @@ def predicted_pose(pose: Floats, velocity: Floats, flight: Flight) -> Floats:
 
 REGION = ("region:-x", "region:-y", "region:-z", "region:+x", "region:+y", "region:+z")
 PITCH = "pitch"
+MARGIN = 2e-5
+"""Distance from a strict row, in m/s or rad/s, at which a velocity surely meets it to the solver."""
 SEPARATION, ZONE, OBSTACLE = "separation", "zone", "obstacle"
 """Kinds of rows: ``separation:<id>``, ``zone:<name>``, ``obstacle:<n>``."""
 FIXED_ROWS = 1 + len(REGION)
@@ -92,6 +94,7 @@ class Barriers:
         self._change = np.full(5, np.inf)
         if flight.response_time_s > 0:
             self._change = np.array(flight.acceleration_limits) * flight.response_time_s
+        self._gentle_change = np.array(flight.jerk_limits) * flight.response_time_s * mission.tick_s
 
     def heed(self, obstacles: Obstacles) -> None:
         """From now on there are rows of these too."""
@@ -141,6 +144,26 @@ class Barriers:
         low = np.minimum(np.maximum(-self._speed, velocity - self._change), 0.0)
         high = np.maximum(np.minimum(self._speed, velocity + self._change), 0.0)
         return low, high
+
+    def gentle_bounds(self, before: Floats, rows: Rows, low: Floats, high: Floats) -> tuple[Floats, Floats]:
+        """``low`` and ``high`` (5,), or where the mission bounds the jerk, what of them is near the velocity (5,) that
+        was commanded ``before``: a change of the command is one of the acceleration, times the lag.
+
+        Comfort never stands against safety: a tick in which even the slowest of these velocities breaks a strict row,
+        or comes so near to it as solutions do, is flown without. So whoever may stop, can.
+        """
+        if np.isinf(self._gentle_change).all():
+            return low, high
+        near_low, near_high = (
+            np.maximum(low, before - self._gentle_change),
+            np.minimum(high, before + self._gentle_change),
+        )
+        if (near_low > near_high).any():  # the vehicle is not where the command would have it
+            return low, high
+        slowest = np.clip(0.0, near_low, near_high)
+        kept = MARGIN * np.linalg.norm(rows.coefficients, axis=1)
+        is_safe = bool((rows.coefficients @ slowest >= rows.bounds + kept).all())
+        return (near_low, near_high) if is_safe else (low, high)
 
 
 def _joined(rows: Rows, names: Sequence[str], coefficients: Floats, bounds: Floats, barriers: Floats) -> Rows:

@@ -1,6 +1,7 @@
 """One drone's quadratic program through OSQP: set up once, then updated and warm-started every tick.
 
-    minimise   eps |u|^2 + w^2, and |u_k - wish_k|^2 for every axis k that is held
+    minimise   eps |u|^2 + w^2, |u_k - wish_k|^2 for every axis k that is held,
+               and smoothing (|u|^2 + |u - flown|^2) where flight is to be smooth
     subject to xi1 . u + xi2 >= w      (sampling, the only row with slack)
                a_k . u >= b_k          (strict rows)
                low <= u <= high
@@ -9,8 +10,8 @@ The cells' importance makes xi1 and xi2 thousands of times larger than a velocit
 with s of the size of xi1 . u, and the cost divided by |xi2| s: the same program, with coefficients near 1 - but for
 eps, which nearly vanishes. It matters where the sampling row can be met, because then it alone chooses among all the
 velocities that do; `EFFORT_FLOOR` keeps it from sinking below what the solver can tell from nothing.
-The paper's controller holds no axis. The baselines hold some, such as the height: softly, because only the strict rows
-may make the program infeasible.
+The paper's controller holds no axis and smooths nothing. The baselines hold some, such as the height: softly, because
+only the strict rows may make the program infeasible.
 Its outcome is a value, never an exception.
 """
 
@@ -42,6 +43,10 @@ the shortest; with it they are within 1 %, and w is off by 1e-4 of xi2."""
 HELD_WEIGHT = 1.0
 """Weight of |u_k - wish_k|^2 in the scaled cost, in which w weighs 2 at most: a held axis moves as wished to TOLERANCE,
 unless a strict row is in the way."""
+SHORTFALL_MAX = 10.0
+"""With smoothing: what the sampling row may seem to lack, in multiples of the most that a velocity contributes. Beyond
+1 it cannot be met, and beyond 10 it hardly matters to the velocity by how far; but the slack's weight would go on
+falling until the solver cannot tell it from nothing."""
 CHECK_EVERY = 5
 """Iterations between two tests of convergence; a warm start often needs no more."""
 ADAPT_EVERY = 200
@@ -75,6 +80,20 @@ class Held:
 NOTHING_HELD = Held(np.zeros(5, np.bool_), np.zeros(5))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Smoothing:
+    """What speed and acceleration cost."""
+
+    weight: float
+    """Of |u|^2 + |u - flown|^2 in the scaled cost, in which w weighs 2 at most; 0: none. The latter is acceleration times
+    the lag."""
+    flown: Floats
+    """(5,) m/s and rad/s."""
+
+
+NOT_SMOOTH = Smoothing(0.0, np.zeros(5))
+
+
 @dataclass(frozen=True, slots=True)
 class Solution:
     outcome: Outcome
@@ -96,6 +115,26 @@ def _length(coefficients: Floats, row: int) -> float:
 
 
 @njit(cache=True, nogil=True)
+def _merge_into_bounds(coefficients: Floats, lower: Floats, upper: Floats) -> None:
+    """Strict rows about one input alone become its bounds, unless that would leave it nothing.
+
+    Where two rows are parallel and nearly the same, such as the pitch's and its bound, the solver moved the multiplier
+    from one to the other in ten thousand iterations, or let its step size grow and shrink for ever.
+    """
+    for k in range(coefficients.shape[0]):
+        length = _length(coefficients, k)
+        row = _STRICT + k
+        for i in range(_INPUTS):
+            share, limit = coefficients[k, i] / length, lower[row]
+            if share == 1.0 and limit <= upper[_BOUNDS + i]:
+                lower[_BOUNDS + i] = max(lower[_BOUNDS + i], limit)
+                lower[row] = -_INFINITY
+            elif share == -1.0 and -limit >= lower[_BOUNDS + i]:
+                upper[_BOUNDS + i] = min(upper[_BOUNDS + i], -limit)
+                lower[row] = -_INFINITY
+
+
+@njit(cache=True, nogil=True)
 def _fill(
     xi1: Floats,
     xi2: float,
@@ -105,6 +144,8 @@ def _fill(
     high: Floats,
     held: NDArray[np.bool_],
     wish: Floats,
+    smoothing: float,
+    flown: Floats,
     effort: float,
     quadratic: Floats,
     linear: Floats,
@@ -121,10 +162,15 @@ def _fill(
     for i in range(_INPUTS):
         reach += abs(xi1[i]) * max(-low[i], high[i])
     reach = max(1e-3, reach)
+    if smoothing > 0:
+        xi2 = max(xi2, -SHORTFALL_MAX * reach)
     cost = reach * max(abs(xi2), reach)
     quadratic[:_INPUTS] = max(2 * effort / cost, EFFORT_FLOOR)
     for i in range(_INPUTS):
         linear[i] = 0.0
+        if smoothing > 0:
+            quadratic[i] += 4 * smoothing
+            linear[i] = -2 * smoothing * flown[i]
         if held[i]:
             quadratic[i] = 2 * HELD_WEIGHT
             linear[i] = -2 * HELD_WEIGHT * wish[i]
@@ -143,6 +189,8 @@ def _fill(
         for i in range(_INPUTS):
             matrix[i * column + 2 + k] = coefficients[k, i] / length
         lower[_STRICT + k] = bounds[k] / length + TOLERANCE
+    if smoothing > 0:
+        _merge_into_bounds(coefficients, lower, upper)
     return bool(np.isfinite(matrix.sum() + lower.sum() + upper.sum() + linear.sum() + cost))
 
 
@@ -202,7 +250,14 @@ class QuadraticProgram:
         )
 
     def solve(
-        self, xi1: Floats, xi2: float, rows: Rows, low: Floats, high: Floats, held: Held = NOTHING_HELD
+        self,
+        xi1: Floats,
+        xi2: float,
+        rows: Rows,
+        low: Floats,
+        high: Floats,
+        held: Held = NOTHING_HELD,
+        smoothing: Smoothing = NOT_SMOOTH,
     ) -> Solution:
         """``xi1`` (5,) and ``xi2`` of the sampling row; strict ``rows``; bounds ``low``, ``high`` (5,) of u.
 
@@ -222,6 +277,8 @@ class QuadraticProgram:
             high,
             held.axes,
             held.wish,
+            smoothing.weight,
+            smoothing.flown,
             self._effort,
             self._quadratic,
             self._linear,

@@ -103,9 +103,17 @@ class Flight(Box):
     """Bound of each velocity component."""
     turn_rate_max_radps: Positive = 0.5
     """Bound of the camera's yaw and pitch rates."""
+    gimbal_rate_max_radps: Positive | None = None
+    """Bound of the pitch rate alone, where the gimbal is slower or faster than the vehicle turns; left out:
+    turn_rate_max_radps."""
     acceleration_max_mps2: Positive = 4.0
     """What the vehicle can do, each axis; with response_time_s it bounds the change of a commanded velocity."""
     angular_acceleration_max_radps2: Positive = 8.0
+    jerk_max_mps3: NonNegative = 0.0
+    """How fast commands may change the acceleration on each axis; 0: no bound. It is exceeded where a drone would break
+    a strict row otherwise. docs/smooth-flight.md."""
+    angular_jerk_max_radps3: NonNegative = 0.0
+    """Likewise of yaw and pitch."""
     response_time_s: NonNegative = 0.15
     """First-order lag from commanded to flown velocity; the barriers look ahead by it."""
     pitch_limits_rad: tuple[Angle, Angle] = (math.pi / 3, math.pi / 2)
@@ -125,12 +133,21 @@ class Flight(Box):
     @property
     def velocity_limits(self) -> tuple[float, float, float, float, float]:
         """Largest x, y, z, yaw and pitch rate, m/s and rad/s."""
-        return (self.speed_max_mps,) * 3 + (self.turn_rate_max_radps,) * 2
+        return (self.speed_max_mps,) * 3 + (self.turn_rate_max_radps, self.pitch_rate_max_radps)
+
+    @property
+    def pitch_rate_max_radps(self) -> float:
+        return self.turn_rate_max_radps if self.gimbal_rate_max_radps is None else self.gimbal_rate_max_radps
 
     @property
     def acceleration_limits(self) -> tuple[float, float, float, float, float]:
         """Likewise of the accelerations."""
         return (self.acceleration_max_mps2,) * 3 + (self.angular_acceleration_max_radps2,) * 2
+
+    @property
+    def jerk_limits(self) -> tuple[float, float, float, float, float]:
+        """Likewise of the jerk, infinite where there is no bound."""
+        return (self.jerk_max_mps3 or math.inf,) * 3 + (self.angular_jerk_max_radps3 or math.inf,) * 2
 
     @model_validator(mode="after")
     def _limits_ascend(self) -> Self:
@@ -155,10 +172,18 @@ class Flight(Box):
         for acceleration, speed in (
             ("acceleration_max_mps2", "speed_max_mps"),
             ("angular_acceleration_max_radps2", "turn_rate_max_radps"),
+            ("angular_acceleration_max_radps2", "gimbal_rate_max_radps"),
         ):
             reach = getattr(self, acceleration) * self.response_time_s
-            if 0 < reach < getattr(self, speed):
+            if 0 < reach < (getattr(self, speed) or 0):
                 raise ValueError(f"{acceleration} x response_time_s, {reach:g}, must be at least {speed}")
+        return self
+
+    @model_validator(mode="after")
+    def _jerk_needs_a_lag(self) -> Self:
+        for jerk in ("jerk_max_mps3", "angular_jerk_max_radps3"):
+            if getattr(self, jerk) > 0 and self.response_time_s == 0:
+                raise ValueError(f"{jerk} needs response_time_s: without a lag there is no acceleration to bound")
         return self
 
 
@@ -171,6 +196,9 @@ class Controller(Settings):
     """Ticks a second of the whole mission, not of the controller alone (paper)."""
     effort_weight: Positive = 0.01
     """epsilon."""
+    smoothing: NonNegative = 0.0
+    """Of planner "coverage": weight of speed and acceleration against what is seen; 0 as in the paper, 0.1 flies with a
+    quarter less acceleration at times within 10 %. docs/smooth-flight.md."""
     coverage_rate_per_s: Positive = 0.012
     """gamma: wished mean decay of a drone's own cells."""
     sampling_gain_per_s: Positive = 1.0
@@ -309,6 +337,8 @@ class Simulation(Settings):
     texture_contrast: Share = 1.0
     """Factor on how far each texture's texels differ from its mean colour: 1 as drawn, 0 plain colours under the same
     light."""
+    exposure_s: Annotated[float, Field(ge=0, le=0.1)] = 0.0
+    """How long the shutter is open: images blur along the camera's motion meanwhile; 0: not at all."""
     image_noise: NonNegative = 2.0
     """Standard deviation of the camera's noise, in grey levels of 255."""
     depth_noise_m: NonNegative = 0.002
@@ -460,12 +490,14 @@ class Mission(Settings):
                 f"controller.separation_gain_per_s: times the tick is {gain:g}, must be at most 0.5:"
                 " two drones could pass their barrier within one tick"
             )
-        turn = self.flight.turn_rate_max_radps * self.tick_s
+        turn = self.flight.pitch_rate_max_radps * self.tick_s
         if high - low < 2 * turn:
             faults.append(
                 f"flight.pitch_limits_rad: {high - low:g} apart, must be at least {2 * turn:g}:"
                 " the gimbal could pass a limit within one tick"
             )
+        if self.controller.smoothing > 0 and self.controller.planner != "coverage":
+            faults.append(f'controller.smoothing: planner "{self.controller.planner}" has none, only "coverage"')
         heights = self.flight.lower_m[2], self.flight.upper_m[2]
         faults += planner_faults(self.controller.planner, self.planners, heights, self.flight.pitch_limits_rad)
         if self.vehicles.kind == "px4":

@@ -151,7 +151,7 @@ def keyframe_rate_hz(mission: Mission, speed_mps: float | None = None) -> float:
     By baseline or by angle, whichever comes first, and looked at once a tick.
     """
     flight, camera = mission.flight, mission.camera
-    fastest_mps, fastest_radps = math.sqrt(3) * flight.speed_max_mps, flight.turn_rate_max_radps
+    fastest_mps, fastest_radps = math.sqrt(3) * flight.speed_max_mps, max(flight.velocity_limits[3:])
     share = 1.0 if speed_mps is None else min(1.0, speed_mps / fastest_mps)
     if share <= 0:
         return 0.0

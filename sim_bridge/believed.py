@@ -17,13 +17,15 @@ KEPT_TICKS = 20
 class BelievedPoses:
     def __init__(self) -> None:
         self._truths: dict[int, Mapping[int, Floats]] = {}
+        self._velocities: dict[int, Mapping[int, Floats]] = {}
         self._newest: dict[int, DroneState] = {}
         self._taken: dict[int, int] = {}
 
-    def note_truth(self, tick: int, poses: Mapping[int, Floats]) -> None:
-        """``poses`` (5,) by drone."""
-        self._truths[tick] = {drone: pose.copy() for drone, pose in poses.items()}
-        self._truths.pop(tick - KEPT_TICKS, None)
+    def note_truth(self, tick: int, poses: Mapping[int, Floats], velocities: Mapping[int, Floats]) -> None:
+        """``poses`` and ``velocities`` (5,) by drone."""
+        for kept, told in (self._truths, poses), (self._velocities, velocities):
+            kept[tick] = {drone: vector.copy() for drone, vector in told.items()}
+            kept.pop(tick - KEPT_TICKS, None)
 
     def hear(self, state: DroneState) -> None:
         known = self._newest.get(state.drone)
@@ -43,5 +45,7 @@ class BelievedPoses:
                 continue
             self._taken[drone] = state.tick
             deviations = state.position_sd_m, state.angle_sd_rad
-            sights.append(Sight(drone, state.tick, truth, np.array(state.pose), deviations))
+            sights.append(
+                Sight(drone, state.tick, truth, np.array(state.pose), deviations, self._velocities[state.tick][drone])
+            )
         return sights

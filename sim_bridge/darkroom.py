@@ -31,10 +31,13 @@ class Darkroom:
         """Keyframes so far."""
         self.lost = 0
 
-    async def photograph(self, tick: int, poses: Mapping[int, Floats], *, wait: bool) -> None:
-        """Take the keyframes that are due at ``tick``; ``poses`` (5,) by drone. ``wait``: until they are sent."""
+    async def photograph(
+        self, tick: int, poses: Mapping[int, Floats], velocities: Mapping[int, Floats], *, wait: bool
+    ) -> None:
+        """Take the keyframes that are due at ``tick``; ``poses`` and ``velocities`` (5,) by drone. ``wait``: until they
+        are sent."""
         if self._photographer is not None:
-            await self._take(self._photographer, self._photographer.due(tick, poses), wait=wait)
+            await self._take(self._photographer, self._photographer.due(tick, poses, velocities), wait=wait)
 
     async def photograph_believed(self, sights: Iterable[Sight], *, wait: bool) -> None:
         """Likewise, of drones that do not know quite where they are."""

@@ -15,7 +15,6 @@ import numpy as np
 
 from protocol import topics
 from protocol.bus import Bus
-from protocol.geometry import Floats
 from protocol.messages import DroneState, Mode, Tick
 from protocol.mission import Mission
 from sim_bridge.darkroom import Darkroom
@@ -67,7 +66,7 @@ class Observer:
         try:
             while not self._is_over():
                 self._bus.put(topics.TICK, self._beat())
-                await self._darkroom.photograph(self._tick, self._poses(), wait=False)
+                await self._photograph()
                 self._tick += 1
                 await asyncio.sleep(max(0.0, began + (self._tick - first) * self._mission.tick_s - loop.time()))
         finally:
@@ -97,10 +96,9 @@ class Observer:
             keyframes=self._darkroom.sent,
         )
 
-    def _poses(self) -> dict[int, Floats]:
-        """Of the cameras that are rendered, of drones in the air."""
-        return {
-            drone: np.array(state.pose)
-            for drone, state in self._states.items()
-            if drone in self._rendered and self._is_live(drone)
-        }
+    async def _photograph(self) -> None:
+        """With the cameras that are rendered, of drones in the air."""
+        flown = [state for drone, state in self._states.items() if drone in self._rendered and self._is_live(drone)]
+        poses = {state.drone: np.array(state.pose) for state in flown}
+        velocities = {state.drone: np.array(state.velocity) for state in flown}
+        await self._darkroom.photograph(self._tick, poses, velocities, wait=False)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -19,6 +19,7 @@ from protocol.keyframe_rule import KeyframeRule, make_keyframe
 from protocol.messages import Keyframe
 from protocol.mission import Mission
 from sim_bridge.camera import Camera, add_depth_noise, add_noise
+from sim_bridge.exposure import expose
 
 POSE_STREAM: Final = 1
 """Random numbers of poses are drawn apart, so that the images do not depend on them."""
@@ -48,6 +49,8 @@ class Sight:
     """(5,)"""
     deviations: tuple[float, float] = (0.0, 0.0)
     """Standard deviations of what is believed, m and rad."""
+    velocity: Floats = field(default_factory=lambda: np.zeros(5))
+    """(5,) the true one, by which images blur."""
 
 
 class Photographer:
@@ -58,9 +61,14 @@ class Photographer:
         self._rules = {drone.id: KeyframeRule(mission.camera) for drone in mission.drones}
         self._taken = dict.fromkeys(self._rules, 0)
 
-    def due(self, tick: int, poses: Mapping[int, Floats]) -> list[Shot]:
-        """The drones, ascending, whose camera has moved enough since its last keyframe; ``poses`` are (5,)."""
-        return self.due_of(Sight(drone, tick, pose, pose) for drone, pose in sorted(poses.items()))
+    def due(self, tick: int, poses: Mapping[int, Floats], velocities: Mapping[int, Floats] | None = None) -> list[Shot]:
+        """The drones, ascending, whose camera has moved enough since its last keyframe; ``poses`` and ``velocities``
+        are (5,), and who has none of these stands still."""
+        moving = velocities or {}
+        return self.due_of(
+            Sight(drone, tick, pose, pose, velocity=moving.get(drone, np.zeros(5)))
+            for drone, pose in sorted(poses.items())
+        )
 
     def due_of(self, sights: Iterable[Sight]) -> list[Shot]:
         """Likewise, of cameras that believe that they have moved enough."""
@@ -68,7 +76,7 @@ class Photographer:
         for sight in sights:
             pose = sight.believed
             if self._rules[sight.drone].wants(pose[:3], camera_rotation(pose[3], pose[4])):
-                kept = replace(sight, truth=sight.truth.copy(), believed=pose.copy())
+                kept = replace(sight, truth=sight.truth.copy(), believed=pose.copy(), velocity=sight.velocity.copy())
                 shots.append(Shot(kept, self._taken[sight.drone]))
                 self._taken[sight.drone] += 1
         return shots
@@ -76,7 +84,8 @@ class Photographer:
     def take(self, shot: Shot) -> Keyframe:
         """Render one; the noise depends on the mission's seed, the drone and the sequence number alone."""
         settings, sight = self._mission.camera, shot.sight
-        image = self._camera.render(sight.truth.tolist())
+        exposure_s, distance_m = self._mission.simulation.exposure_s, self._mission.sensing.distance_m
+        image = expose(self._camera, sight.truth, sight.velocity, exposure_s, self._intrinsics, distance_m)
         generator = np.random.default_rng([self._mission.seed, shot.drone, shot.sequence])
         if self._mission.simulation.image_noise > 0:
             image = add_noise(image, self._mission.simulation.image_noise, generator)

@@ -123,7 +123,7 @@ class Simulator:
                 if self._contacts is not None:
                     self._contacts.note({drone: poses[drone] for drone in poses if not self._bodies[drone].landing})
                 if self._believed is not None:
-                    self._believed.note_truth(self._tick, poses)
+                    self._believed.note_truth(self._tick, poses, self._velocities())
                 self._publish(self._beat())
                 await self._scanner.scan(self._tick, poses, wait=self._lockstep)
                 await self._photograph(poses)
@@ -154,12 +154,15 @@ class Simulator:
         """What cameras see at ``poses`` (5,), posed where their drones believe to be."""
         believed = self._believed
         if believed is None:
-            await self._darkroom.photograph(self._tick, poses, wait=self._lockstep)
+            await self._darkroom.photograph(self._tick, poses, self._velocities(), wait=self._lockstep)
             return
         if self._lockstep:
             tick = self._tick
             await self._stand_still(lambda: believed.has(tick, [*self._live(), *self._aground()]), LOCKSTEP_PATIENCE_S)
         await self._darkroom.photograph_believed(believed.take(), wait=self._lockstep)
+
+    def _velocities(self) -> dict[int, Floats]:
+        return {drone: body.velocity for drone, body in self._bodies.items()}
 
     def _live(self) -> list[int]:
         return [drone for drone in sorted(self._bodies) if self._is_live(drone)]

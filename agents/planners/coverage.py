@@ -24,7 +24,8 @@ class CoverageController(FilteredPlanner):
     ) -> Decision:
         xi1, xi2 = sampling_row(self._mission, terms, cells * self._mission.controller.coverage_rate_per_s)
         sampling = self._mission.sensing.decay_per_s * terms.first
-        return self._filter.solve(pose, velocity, neighbours, xi1, xi2, sampling=sampling)
+        smoothing = self._mission.controller.smoothing
+        return self._filter.solve(pose, velocity, neighbours, xi1, xi2, sampling=sampling, smoothing=smoothing)
 
 
 def sampling_row(mission: Mission, terms: SamplingTerms, wished: float) -> tuple[Floats, float]:

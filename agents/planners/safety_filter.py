@@ -12,7 +12,7 @@ import numpy as np
 from agents.barriers import FIXED_ROWS, OBSTACLE, SEPARATION, ZONE, Barriers, Neighbour, Rows, predicted_pose
 from agents.obstacles import Obstacles
 from agents.planners.planner import STAY, Decision
-from agents.quadratic_program import NOTHING_HELD, Held, QuadraticProgram
+from agents.quadratic_program import NOTHING_HELD, Held, QuadraticProgram, Smoothing
 from protocol.airspace import airspace_of
 from protocol.geometry import Floats
 from protocol.mission import Mission
@@ -35,6 +35,7 @@ class SafetyFilter:
         zones = 0 if airspace_of(mission.flight).is_open else ZONE_ROWS
         self._program = QuadraticProgram(FIXED_ROWS + neighbours + zones, mission.controller.effort_weight)
         self._obstacles: Obstacles | None = None
+        self._before: Floats = np.zeros(5)
 
     def heed(self, obstacles: Obstacles) -> None:
         """Rows of what is not free are strict as well from now on."""
@@ -53,9 +54,25 @@ class SafetyFilter:
         *,
         sampling: float = 0.0,
         held: Held = NOTHING_HELD,
+        smoothing: float = 0.0,
     ) -> Decision:
-        """The velocity that meets ``xi1 . u + xi2 >= 0`` best, with the ``held`` axes as wished; the strict rows are
-        never relaxed. ``sampling`` is passed on."""
+        """The velocity that meets ``xi1 . u + xi2 >= 0`` best, with the ``held`` axes as wished, at what speed and
+        acceleration cost by ``smoothing``; the strict rows are never relaxed. ``sampling`` is passed on."""
+        decision = self._solve(pose, velocity, neighbours, xi1, xi2, sampling, held, Smoothing(smoothing, velocity))
+        self._before = decision.velocity
+        return decision
+
+    def _solve(
+        self,
+        pose: Floats,
+        velocity: Floats,
+        neighbours: Sequence[Neighbour],
+        xi1: Floats,
+        xi2: float,
+        sampling: float,
+        held: Held,
+        smoothing: Smoothing,
+    ) -> Decision:
         settings, flight = self._mission.controller, self._mission.flight
         predicted = predicted_pose(pose, velocity, flight)
         rows = self._barriers.rows(predicted, neighbours)
@@ -65,7 +82,8 @@ class SafetyFilter:
         ):  # more zones are near, or somebody not in the mission was heard of
             room = len(rows.names) + (0 if self._obstacles is None else OBSTACLE_ROWS)
             self._program = QuadraticProgram(room, settings.effort_weight)
-        solution = self._program.solve(xi1, xi2, rows, low, high, held)
+        gentle = self._barriers.gentle_bounds(self._before, rows, low, high)
+        solution = self._program.solve(xi1, xi2, rows, *gentle, held, smoothing)
         if solution.outcome == "solved":
             return Decision(solution.velocity, "solved", solution.slack, sampling, rows, solution.active)
         return Decision(self.brake(rows, low, high), solution.outcome, 0.0, sampling, rows, ())

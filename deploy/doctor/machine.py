@@ -48,7 +48,8 @@ def memory_need(mission: Mission) -> float:
 def disk_need(mission: Mission) -> float:
     """Bytes that the run's folder grows to if the mission flies for its whole duration, at most about."""
     camera, flight, box = mission.camera, mission.flight, mission.target
-    rate_hz = flight.speed_max_mps / camera.keyframe_baseline_m + flight.turn_rate_max_radps / camera.keyframe_angle_rad
+    turning_hz = max(flight.velocity_limits[3:]) / camera.keyframe_angle_rad
+    rate_hz = flight.speed_max_mps / camera.keyframe_baseline_m + turning_hz
     images = rate_hz * JPEG_BYTES_PER_PIXEL * camera.width_px * camera.height_px if mission.simulation.scene else 0.0
     drones_seconds = len(mission.drones) * mission.duration_s
     volume = VOXEL_BYTES * voxels(mission)

@@ -82,7 +82,7 @@ def state(drone: int, tick: int, x: float) -> DroneState:
 
 def test_cameras_see_from_where_drones_are_and_say_where_they_believed_to_be() -> None:
     believed = BelievedPoses()
-    believed.note_truth(3, {1: TRUTH, 2: TRUTH + 1})
+    believed.note_truth(3, {1: TRUTH, 2: TRUTH + 1}, {1: np.zeros(5), 2: np.ones(5)})
     believed.hear(state(2, 3, 5.0))
     assert believed.has(3, [2])
     assert not believed.has(3, [1, 2])
@@ -97,7 +97,7 @@ def test_cameras_see_from_where_drones_are_and_say_where_they_believed_to_be() -
 def test_a_state_whose_truth_is_forgotten_takes_no_picture() -> None:
     believed = BelievedPoses()
     for tick in range(BELIEVED_TICKS + 1):
-        believed.note_truth(tick, {1: TRUTH})
+        believed.note_truth(tick, {1: TRUTH}, {1: np.zeros(5)})
     believed.hear(state(1, 0, 4.0))
     assert believed.take() == []
 
