@@ -85,8 +85,8 @@ class Smoothing:
     """What speed and acceleration cost."""
 
     weight: float
-    """Of |u|^2 + |u - flown|^2 in the scaled cost, in which w weighs 2 at most; 0: none. The latter is acceleration times
-    the lag."""
+    """Of |u|^2 + |u - flown|^2 in the scaled cost, in which w weighs 2 at most; 0: none. u - flown is the acceleration
+    times the lag."""
     flown: Floats
     """(5,) m/s and rad/s."""
 

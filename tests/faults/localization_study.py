@@ -38,7 +38,7 @@ from sim_bridge.lidar import LidarSensor, directions, measure
 from sim_bridge.photographer import Photographer
 from sim_bridge.scenes.cache import scene_cache
 from sim_bridge.scenes.lighting import ray_caster
-from sim_bridge.scenes.scene import load_scene
+from sim_bridge.scenes.scene import Scene, load_scene
 from sim_bridge.scenes.truth import write_truth
 
 Pattern = Callable[[np.random.Generator, Lidar], Floats]
@@ -185,33 +185,37 @@ def fly_mission(folder: Path, mission: Mission) -> dict[str, Any]:
     map that is made of its keyframes afterwards; in so short a flight nothing would have jumped yet."""
     figures = folder / "figures.json"
     if not figures.exists():
-        folder.mkdir(parents=True)
         scene = load_scene(SCENE, relative_to=Path(), cache=scene_cache())
-        write_truth(scene, mission, folder, cache=scene_cache())
-
-        async def main() -> None:
-            async with located(mission, folder, seed=1) as team:
-                team.photographer = Photographer(mission, Camera(scene, mission.camera.intrinsics()))
-                if mission.localization.source == "lidar":
-                    team.sensor = LidarSensor(scene, mission.lidar, mission.seed)
-                await team.until_over()
-                if team.failed():
-                    raise SystemExit("\n".join(team.failed()))
-                keyframes.extend(team.keyframes)
-
-        keyframes: list[Keyframe] = []
-        run(main())
-        mapper = Mapper(mission, VirtualField.of(mission.target), folder, NoKeyframes())
-        for keyframe in keyframes:
-            mapper.add([keyframe])
-        scores = mapper.finish().scores
-        assert scores is not None
-        told = json.loads((folder / "summary.json").read_text())
-        told |= {"f_score_visible": scores.visible.f, "f_score_objects": scores.objects.f}
-        told |= {"keyframes": len(keyframes), "keyframes_unlocated": mapper.unlocated}
+        told = fly_and_map(folder, mission, Photographer(mission, Camera(scene, mission.camera.intrinsics())), scene)
         figures.write_text(json.dumps(told))
     content: dict[str, Any] = json.loads(figures.read_text())
     return content
+
+
+def fly_and_map(folder: Path, mission: Mission, photographer: Photographer, scene: Scene) -> dict[str, Any]:
+    folder.mkdir(parents=True)
+    write_truth(scene, mission, folder, cache=scene_cache())
+
+    async def main() -> None:
+        async with located(mission, folder, seed=1) as team:
+            team.photographer = photographer
+            if mission.localization.source == "lidar":
+                team.sensor = LidarSensor(scene, mission.lidar, mission.seed)
+            await team.until_over()
+            if team.failed():
+                raise SystemExit("\n".join(team.failed()))
+            keyframes.extend(team.keyframes)
+
+    keyframes: list[Keyframe] = []
+    run(main())
+    mapper = Mapper(mission, VirtualField.of(mission.target), folder, NoKeyframes())
+    for keyframe in keyframes:
+        mapper.add([keyframe])
+    scores = mapper.finish().scores
+    assert scores is not None
+    told: dict[str, Any] = json.loads((folder / "summary.json").read_text())
+    told |= {"f_score_visible": scores.visible.f, "f_score_objects": scores.objects.f}
+    return told | {"keyframes": len(keyframes), "keyframes_unlocated": mapper.unlocated}
 
 
 # --- the page --------------------------------------------------------------------------------------------------------

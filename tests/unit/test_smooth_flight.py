@@ -151,7 +151,7 @@ def test_a_smooth_team_turns_about_less_often_accelerates_less_and_sees_as_much(
 
 
 def test_smoothing_is_of_the_coverage_planner_alone() -> None:
-    with pytest.raises(ValidationError, match='controller.smoothing: planner "lawnmower" has none'):
+    with pytest.raises(ValidationError, match=r'controller\.smoothing: planner "lawnmower" has none'):
         Mission(drones=LONE, controller=Controller(planner="lawnmower", smoothing=0.1))
 
 
@@ -221,7 +221,7 @@ def test_somebody_who_comes_near_is_given_way_to_at_once() -> None:
         fast = safety.steer(MIDDLE, ahead, [], ahead).velocity
     assert fast[0] == pytest.approx(0.5, abs=0.01)
 
-    near = Neighbour(2, MIDDLE[:3] + [widened_separation(JERKY) + 0.15 * 0.5 + 0.001, 0, 0], 0.0)
+    near = Neighbour(2, MIDDLE[:3] + np.array([widened_separation(JERKY) + 0.15 * 0.5 + 0.001, 0, 0]), 0.0)
     given_way = safety.steer(MIDDLE, ahead, [near], ahead)
 
     assert given_way.outcome == "solved"
