@@ -53,7 +53,8 @@ def _light_of_value() -> NDArray[np.uint32]:
     """(256,) by the sRGB standard, IEC 61966-2-1; 65535 is white."""
     value = np.arange(256) / 255
     light = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-    return np.rint(_FULL * light).astype(np.uint32)
+    whole: NDArray[np.uint32] = np.rint(_FULL * light).astype(np.uint32)
+    return whole
 
 
 @cache

@@ -1,9 +1,9 @@
 """What smooth flight costs and brings, before and after: docs/smooth-flight.md.
 
-    PYTHONPATH=.:tests .venv/bin/python -m faults.smooth_study FOLDER
+    PYTHONPATH=.:tests .venv/bin/python -m faults.smooth_study FOLDER [teams]
 
-Teams in one process until J < 0.1, then one flight with cameras that blur until J < 0.5, and its map. What lies in
-FOLDER already is not flown again.
+Teams in one process until J < 0.1; then, unless "teams" is said, flights with cameras that blur until J < 0.5, and their
+maps, which take minutes each. What lies in FOLDER already is not flown again.
 """
 
 from __future__ import annotations
@@ -189,13 +189,19 @@ def draw(flown: dict[tuple[int, int, float], dict[str, Any]]) -> None:
             np.arange(len(trace)) * TRACE_S / len(trace), trace, color=colour, lw=1, label=f"smoothing {weight:g}"
         )
     left.set(xlabel="time, s", ylabel="J", xlim=(0, None), ylim=(0, 1), title="importance, three flights each")
-    right.set(xlabel="time, s", ylabel="m/s", xlim=(0, TRACE_S), title="a drone's velocity along x, team of two")
+    right.set(
+        xlabel="time, s",
+        ylabel="m/s",
+        xlim=(0, TRACE_S),
+        ylim=(-0.6, 0.75),
+        title="a drone's velocity along x, team of two",
+    )
     left.legend(fontsize=7)
-    right.legend(fontsize=7, loc="lower right")
+    right.legend(fontsize=7, loc="upper right", ncols=2)
     figure.savefig(PICTURE, dpi=110)
 
 
-def tables(folder: Path) -> str:
+def tables(folder: Path, *, maps: bool) -> str:
     flown = {}
     for count in TEAMS:
         for seed in SEEDS:
@@ -215,6 +221,9 @@ def tables(folder: Path) -> str:
         for weight, flights in zip(WEIGHTS, pair, strict=True):
             lines.append(row(f"{count} drones, smoothing {weight:g}", flights))
         lines.append(changes(*pair))
+    draw(flown)
+    if not maps:
+        return "\n".join(lines)
     lines += [
         "",
         "| exposure, s | smoothing | s to J < 0.5 | keyframes | sharpness | F visible | F objects |",
@@ -231,14 +240,13 @@ def tables(folder: Path) -> str:
                 f"| {exposure_s:g} | {weight:g} | {told['sim_time_s']:.0f} | {told['keyframes']}"
                 f" | {told['sharpness']:.2f} | {told['f_score_visible']:.3f} | {told['f_score_objects']:.3f} |"
             )
-    draw(flown)
     return "\n".join(lines)
 
 
 def main(arguments: list[str]) -> None:
     folder = Path(arguments[0])
     folder.mkdir(parents=True, exist_ok=True)
-    measured = tables(folder)
+    measured = tables(folder, maps="teams" not in arguments[1:])
     before, _, rest = PAGE.read_text().partition(BEGIN)
     _, _, after = rest.partition(END)
     PAGE.write_text(f"{before}{BEGIN}\n{measured}\n{END}{after}")
