@@ -2,8 +2,8 @@
 
     PYTHONPATH=.:tests .venv/bin/python -m faults.smooth_study FOLDER [teams]
 
-Teams in one process until J < 0.1; then, unless "teams" is said, flights with cameras that blur until J < 0.5, and their
-maps, which take minutes each. What lies in FOLDER already is not flown again.
+Teams in one process until J < 0.1; then, unless "teams" is said, flights with cameras that blur until J < 0.5, and the
+maps of them, which take minutes. What lies in FOLDER already is not flown again.
 """
 
 from __future__ import annotations
