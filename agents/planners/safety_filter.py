@@ -33,7 +33,7 @@ class SafetyFilter:
         self._mission = mission
         self._barriers = Barriers(mission)
         zones = 0 if airspace_of(mission.flight).is_open else ZONE_ROWS
-        self._program = QuadraticProgram(FIXED_ROWS + neighbours + zones, mission.controller.effort_weight)
+        self._set_up(FIXED_ROWS + neighbours + zones)
         self._obstacles: Obstacles | None = None
         self._before: Floats = np.zeros(5)
 
@@ -41,8 +41,7 @@ class SafetyFilter:
         """Rows of what is not free are strict as well from now on."""
         self._obstacles = obstacles
         self._barriers.heed(obstacles)
-        room = self._program.strict_rows + OBSTACLE_ROWS
-        self._program = QuadraticProgram(room, self._mission.controller.effort_weight)
+        self._set_up(self._program.strict_rows + OBSTACLE_ROWS)
 
     def solve(
         self,
@@ -73,20 +72,22 @@ class SafetyFilter:
         held: Held,
         smoothing: Smoothing,
     ) -> Decision:
-        settings, flight = self._mission.controller, self._mission.flight
-        predicted = predicted_pose(pose, velocity, flight)
+        predicted = predicted_pose(pose, velocity, self._mission.flight)
         rows = self._barriers.rows(predicted, neighbours)
         low, high = self._barriers.velocity_bounds(velocity)
-        if (
-            len(rows.names) > self._program.strict_rows
-        ):  # more zones are near, or somebody not in the mission was heard of
-            room = len(rows.names) + (0 if self._obstacles is None else OBSTACLE_ROWS)
-            self._program = QuadraticProgram(room, settings.effort_weight)
+        if len(rows.names) > self._program.strict_rows:  # more zones are near, or somebody not in the mission is there
+            self._set_up(len(rows.names) + (0 if self._obstacles is None else OBSTACLE_ROWS))
+        program = self._smooth_program if smoothing.weight > 0 else self._program
         gentle = self._barriers.gentle_bounds(self._before, rows, low, high)
-        solution = self._program.solve(xi1, xi2, rows, *gentle, held, smoothing)
+        solution = program.solve(xi1, xi2, rows, *gentle, held, smoothing)
         if solution.outcome == "solved":
             return Decision(solution.velocity, "solved", solution.slack, sampling, rows, solution.active)
         return Decision(self.brake(rows, low, high), solution.outcome, 0.0, sampling, rows, ())
+
+    def _set_up(self, strict_rows: int) -> None:
+        effort = self._mission.controller.effort_weight
+        self._program = QuadraticProgram(strict_rows, effort)
+        self._smooth_program = QuadraticProgram(strict_rows, effort, smooth=True)
 
     def steer(self, pose: Floats, velocity: Floats, neighbours: Sequence[Neighbour], wish: Floats = STAY) -> Decision:
         """The same program with another question: xi1 . u + xi2 >= 0 means "as fast as ``wish``, along it", and nothing
