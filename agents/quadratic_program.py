@@ -43,10 +43,10 @@ the shortest; with it they are within 1 %, and w is off by 1e-4 of xi2."""
 HELD_WEIGHT = 1.0
 """Weight of |u_k - wish_k|^2 in the scaled cost, in which w weighs 2 at most: a held axis moves as wished to TOLERANCE,
 unless a strict row is in the way."""
-SHORTFALL_MAX = 10.0
-"""With smoothing: what the sampling row may seem to lack, in multiples of the most that a velocity contributes. Beyond
-1 it cannot be met, and beyond 10 it hardly matters to the velocity by how far; but the slack's weight would go on
-falling until the solver cannot tell it from nothing."""
+XI2_MAX = 10.0
+"""With smoothing: size of xi2 in multiples of the most that a velocity contributes to the sampling row. Beyond 1 the
+row is met whatever is flown, or never; beyond 10 it hardly matters to the velocity by how far, but the slack's weight
+would go on falling until the solver cannot tell it from nothing."""
 CHECK_EVERY = 5
 """Iterations between two tests of convergence; a warm start often needs no more."""
 ADAPT_EVERY = 200
@@ -166,7 +166,7 @@ def _fill(
         reach += abs(xi1[i]) * max(-low[i], high[i])
     reach = max(1e-3, reach)
     if smoothing > 0:
-        xi2 = max(xi2, -SHORTFALL_MAX * reach)
+        xi2 = min(max(xi2, -XI2_MAX * reach), XI2_MAX * reach)
     cost = reach * max(abs(xi2), reach)
     quadratic[:_INPUTS] = max(2 * effort / cost, EFFORT_FLOOR)
     for i in range(_INPUTS):

@@ -197,8 +197,8 @@ class Controller(Settings):
     effort_weight: Positive = 0.01
     """epsilon."""
     smoothing: NonNegative = 0.0
-    """Of planner "coverage": weight of speed and acceleration against what is seen; 0 as in the paper, at 0.1 a fifth
-    less acceleration and blur, and 3 to 13 % more time. docs/smooth-flight.md."""
+    """Of planner "coverage": weight of speed and acceleration against what is seen; 0 as in the paper, at 0.1 a
+    quarter less acceleration and blur, and 3 to 10 % more time. docs/smooth-flight.md."""
     coverage_rate_per_s: Positive = 0.012
     """gamma: wished mean decay of a drone's own cells."""
     sampling_gain_per_s: Positive = 1.0
