@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.mission import Feedback
+from protocol.map_settings import Feedback
 
 
 class FeedbackSchedule:

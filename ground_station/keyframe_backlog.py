@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from protocol.geometry import Floats
+from protocol.map_settings import Camera
 from protocol.messages import Keyframe
-from protocol.mission import Camera
 
 WAITING_MAX: Final = 200
 """Keyframes that may wait: some ten seconds of four drones."""

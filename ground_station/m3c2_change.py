@@ -12,7 +12,8 @@ from ground_station.m3c2 import Cloud, Lattice, changed_cells, core_points, disp
 from ground_station.mesh_change import checked
 from ground_station.reconstruction.reconstructor import Mesh
 from protocol.geometry import Floats
-from protocol.mission import Box, Cylinder, Feedback
+from protocol.map_settings import Cylinder, Feedback
+from protocol.mission import Box
 
 
 class M3C2MeshChange:

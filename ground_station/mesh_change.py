@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from ground_station.reconstruction.reconstructor import Mesh
 from protocol.errors import ReconstructionError
 from protocol.field import cell_centres
-from protocol.mission import Box, Feedback
+from protocol.map_settings import Feedback
+from protocol.mission import Box
 
 Floats: TypeAlias = NDArray[np.float64]
 Counts: TypeAlias = NDArray[np.int32]

@@ -10,7 +10,8 @@ from ground_station.reconstruction.backends import make_reconstructor
 from ground_station.reconstruction.reconstructor import Keyframe
 from protocol.field import VirtualField
 from protocol.geometry import camera_rotation
-from protocol.mission import Camera, Mission, Reconstruction, Target
+from protocol.map_settings import Camera, Reconstruction
+from protocol.mission import Mission, Target
 
 HEIGHT_M = 1.2
 """Of the camera above the floor of the target."""

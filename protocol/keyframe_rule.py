@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from protocol.geometry import Floats, Intrinsics
+from protocol.map_settings import Camera
 from protocol.messages import Keyframe
-from protocol.mission import Camera
 
 
 class KeyframeRule:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from protocol.geometry import Floats
-from protocol.mission import Camera
+from protocol.map_settings import Camera
 
 
 @dataclass(frozen=True, slots=True)

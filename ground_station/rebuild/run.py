@@ -16,7 +16,8 @@ from ground_station.reconstruction.reconstructor import Mesh, Statistics
 from ground_station.replay.settings import with_settings
 from protocol.errors import CovreconError
 from protocol.field import VirtualField
-from protocol.mission import Mission, Reconstruction
+from protocol.map_settings import Reconstruction
+from protocol.mission import Mission
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from ground_station.reconstruction.plane_sweep import PlaneSweep
 from ground_station.reconstruction.semi_global import Disparity, SemiGlobal
 from ground_station.reconstruction.views import View
 from protocol.errors import ReconstructionError
-from protocol.mission import Reconstruction
+from protocol.map_settings import Reconstruction
 
 BEYOND: Final = 4.0
 """The plane beyond the farthest depth is at most so many times as far: inverse depths stay positive with few planes."""

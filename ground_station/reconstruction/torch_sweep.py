@@ -21,7 +21,7 @@ from ground_station.reconstruction.plane_sweep import COST_MAX, NOISE_VARIANCE, 
 from ground_station.reconstruction.semi_global import BORDER, CONTRAST, JUMP_PENALTY, STEP_PENALTY, Disparity
 from ground_station.reconstruction.views import View
 from protocol.errors import ReconstructionError
-from protocol.mission import Reconstruction
+from protocol.map_settings import Reconstruction
 
 BEHIND: Final = 1e-6
 """Least scale of a homogeneous pixel that lies before the camera."""

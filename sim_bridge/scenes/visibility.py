@@ -17,7 +17,8 @@ from scipy.ndimage import label
 
 from protocol.airspace import airspace_of
 from protocol.geometry import Floats, camera_rotation
-from protocol.mission import Box, Camera, Mission
+from protocol.map_settings import Camera
+from protocol.mission import Box, Mission
 from sim_bridge.scenes.lighting import even_directions, ray_caster
 from sim_bridge.scenes.scene import Scene
 

@@ -18,7 +18,8 @@ from ground_station.mesh_change import GridMeshChange, MeshChange
 from ground_station.reconstruction.reconstructor import Mesh
 from protocol.field import VirtualField, cell_centres
 from protocol.geometry import Floats
-from protocol.mission import Feedback, Target
+from protocol.map_settings import Feedback
+from protocol.mission import Target
 
 Record = Callable[..., None]
 TARGET = Target()

@@ -10,7 +10,8 @@ import numpy as np
 from ground_station.reconstruction.plane_sweep_reconstructor import PlaneSweepReconstructor
 from ground_station.reconstruction.reconstructor import Keyframe
 from protocol.geometry import camera_rotation
-from protocol.mission import Drone, Mission, Reconstruction
+from protocol.map_settings import Reconstruction
+from protocol.mission import Drone, Mission
 from sim_bridge.camera import Camera
 from sim_bridge.scenes.random_room import random_room
 from sim_bridge.scenes.scene import pack_scene

@@ -15,7 +15,8 @@ from ground_station.reconstruction.reconstructor import Mesh
 from protocol.errors import ReconstructionError
 from protocol.field import VirtualField
 from protocol.geometry import Floats
-from protocol.mission import Drone, Feedback, Mission, Target
+from protocol.map_settings import Feedback
+from protocol.mission import Drone, Mission, Target
 
 TARGET = Target(lower_m=(-1.0, -0.8, 0.0), upper_m=(1.1, 0.8, 0.9))
 FIELD = VirtualField.of(TARGET)

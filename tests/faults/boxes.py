@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from ground_station.reconstruction.reconstructor import Keyframe, Mesh
 from protocol.geometry import Floats, Intrinsics, camera_rotation
-from protocol.mission import Camera, Drone, Mission, Reconstruction, Target
+from protocol.map_settings import Camera, Reconstruction
+from protocol.mission import Drone, Mission, Target
 
 CAMERA = Camera(width_px=160, height_px=90)
 DEPTH_PX = (96, 54)

@@ -14,8 +14,9 @@ from PIL import Image
 from ground_station.keyframe_log import KEYFRAMES_FILE, KeyframeLog
 from ground_station.results import MISSION_FILE
 from protocol.geometry import Intrinsics, camera_rotation
+from protocol.map_settings import Camera, Feedback, Reconstruction
 from protocol.messages import Keyframe
-from protocol.mission import Camera, Drone, Feedback, Mission, Reconstruction, Target
+from protocol.mission import Drone, Mission, Target
 
 MISSION = Mission(
     target=Target(lower_m=(-1, -1, 0), upper_m=(1, 1, 0.4)),

@@ -28,8 +28,9 @@ from ground_station.mapper import Mapper
 from protocol.field import VirtualField
 from protocol.geometry import Floats
 from protocol.localization_settings import EstimateNoise, Lidar, Localization
+from protocol.map_settings import Feedback
 from protocol.messages import Keyframe
-from protocol.mission import Drone, Feedback, Mission, Simulation
+from protocol.mission import Drone, Mission, Simulation
 from protocol.operation_settings import Recording
 from protocol.separation import SIGMAS
 from sim_bridge.camera import Camera

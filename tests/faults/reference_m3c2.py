@@ -10,7 +10,7 @@ import py4dgeo
 from numpy.typing import NDArray
 
 from protocol.geometry import Floats
-from protocol.mission import Cylinder
+from protocol.map_settings import Cylinder
 
 logging.getLogger("py4dgeo").setLevel(logging.WARNING)  # what it logs goes to a file in the working directory as well
 

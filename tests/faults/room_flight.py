@@ -9,8 +9,9 @@ from PIL import Image
 
 from protocol.geometry import camera_rotation
 from protocol.keyframe_rule import make_keyframe
+from protocol.map_settings import Reconstruction
 from protocol.messages import Keyframe
-from protocol.mission import Drone, Mission, Reconstruction
+from protocol.mission import Drone, Mission
 from sim_bridge.camera import Camera
 from sim_bridge.scenes.random_room import random_room
 from sim_bridge.scenes.scene import pack_scene

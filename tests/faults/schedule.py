@@ -6,17 +6,8 @@ import random
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from protocol.mission import (
-    Controller,
-    Drone,
-    Feedback,
-    Flight,
-    Mission,
-    Reconstruction,
-    Replication,
-    Simulation,
-    Target,
-)
+from protocol.map_settings import Feedback, Reconstruction
+from protocol.mission import Controller, Drone, Flight, Mission, Replication, Simulation, Target
 from protocol.transport_settings import Transport
 
 FAULTY_S = 36.0

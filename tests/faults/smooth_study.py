@@ -22,8 +22,9 @@ from PIL import Image
 from faults.localization_study import SCENE, fly_and_map
 from faults.team_flight import TeamFlight
 from protocol.geometry import Floats
+from protocol.map_settings import Feedback
 from protocol.messages import Keyframe
-from protocol.mission import Controller, Drone, Feedback, Mission, Simulation
+from protocol.mission import Controller, Drone, Mission, Simulation
 from protocol.operation_settings import Recording
 from sim_bridge.camera import Camera
 from sim_bridge.exposure import image_rate

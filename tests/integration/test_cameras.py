@@ -22,8 +22,9 @@ from agents.cameras.frame_clock import SETTLED_S
 from agents.cameras.opencv import SILENCE_S, OpenCvCamera
 from faults.rtsp_server import RATE_HZ, RtspServer, draw_number, read_number
 from protocol.errors import VehicleError
+from protocol.map_settings import Camera
 from protocol.messages import Keyframe
-from protocol.mission import Camera, Drone, Mission
+from protocol.mission import Drone, Mission
 
 pytestmark = pytest.mark.light
 

@@ -15,8 +15,9 @@ from faults.team import Member, Team, flying
 from faults.virtual_loop import run
 from ground_station.ground_station import GroundStation
 from protocol import topics
+from protocol.map_settings import Feedback, Reconstruction
 from protocol.messages import DroneState, Event
-from protocol.mission import Drone, Feedback, Flight, Mission, Reconstruction, Simulation, Target
+from protocol.mission import Drone, Flight, Mission, Simulation, Target
 from protocol.wire import decode
 
 SIDE = 3

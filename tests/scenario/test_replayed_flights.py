@@ -18,7 +18,8 @@ from ground_station.mapper import Mapper
 from ground_station.recording.entries import IntegratedTick, JumpRecord
 from ground_station.replay.engine import Replay
 from protocol.field import VirtualField
-from protocol.mission import Drone, Feedback, Flight, Mission, Reconstruction, Simulation, Target
+from protocol.map_settings import Feedback, Reconstruction
+from protocol.mission import Drone, Flight, Mission, Simulation, Target
 
 SEED = 3
 DURATION_S = 15.0

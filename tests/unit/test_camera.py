@@ -6,8 +6,9 @@ import pytest
 
 from protocol.depth_image import decode_depth
 from protocol.geometry import Intrinsics, camera_rotation
-from protocol.mission import Camera as CameraSettings
-from protocol.mission import Drone, Mission, Reconstruction
+from protocol.map_settings import Camera as CameraSettings
+from protocol.map_settings import Reconstruction
+from protocol.mission import Drone, Mission
 from sim_bridge.camera import BACKGROUND, Camera, add_depth_noise, add_noise
 from sim_bridge.photographer import Photographer
 from sim_bridge.rasteriser import NEAR_M

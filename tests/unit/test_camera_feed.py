@@ -19,8 +19,9 @@ from agents.cameras.feed import RETRY_S, CameraFeed
 from agents.cameras.pose_history import BEYOND_MAX_S
 from protocol.errors import BusError, CovreconError, VehicleError
 from protocol.geometry import Floats, camera_rotation
+from protocol.map_settings import Camera
 from protocol.messages import Keyframe
-from protocol.mission import Camera, Drone, Mission
+from protocol.mission import Drone, Mission
 from protocol.wire import decode, encode
 
 PATIENCE_S = 20.0

@@ -26,7 +26,8 @@ from deploy.doctor.network import check_network
 from deploy.doctor.ports import Place, check_place, places
 from deploy.doctor_command import doctor
 from deploy.pki.authority import init, renew
-from protocol.mission import Drone, Mission, Reconstruction, Transport
+from protocol.map_settings import Reconstruction
+from protocol.mission import Drone, Mission, Transport
 from protocol.operation_settings import Console, Metrics, Recording
 from protocol.vehicle_settings import Vehicles
 

@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 
 from protocol.geometry import Floats
+from protocol.map_settings import Camera as CameraSettings
 from protocol.messages import Keyframe
-from protocol.mission import Camera as CameraSettings
 from protocol.mission import Drone, Mission, Simulation
 from sim_bridge.camera import Camera
 from sim_bridge.exposure import expose, renderings

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ground_station.feedback import FeedbackSchedule
-from protocol.mission import Feedback
+from protocol.map_settings import Feedback
 
 CHANGE = np.array([0.0, 0.25, 1.0], np.float32)
 

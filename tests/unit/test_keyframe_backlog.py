@@ -9,8 +9,8 @@ import numpy as np
 from ground_station.keyframe_backlog import KeyframeBacklog
 from protocol.geometry import Intrinsics, camera_rotation
 from protocol.keyframe_rule import make_keyframe
+from protocol.map_settings import Camera
 from protocol.messages import Keyframe
-from protocol.mission import Camera
 
 CAMERA = Camera()
 LENS = Intrinsics.from_field_of_view(96, 54, 1.287)

@@ -9,7 +9,7 @@ import pytest
 
 from protocol.geometry import Floats, camera_rotation
 from protocol.keyframe_rule import KeyframeRule
-from protocol.mission import Camera
+from protocol.map_settings import Camera
 
 CAMERA = Camera(keyframe_baseline_m=0.12, keyframe_angle_rad=math.radians(15))
 ORIGIN = np.zeros(3)

@@ -15,7 +15,8 @@ from ground_station.reconstruction.learned.training.folder import begin, missing
 from ground_station.reconstruction.learned.training.lessons import STEPS, _turned, draw_lesson, load_room, to_coarse
 from ground_station.reconstruction.learned.training.settings import TrainingSettings, load_settings
 from protocol.errors import ReconstructionError, TrainingError
-from protocol.mission import Drone, Learned, Mission, Reconstruction, Target
+from protocol.map_settings import Learned, Reconstruction
+from protocol.mission import Drone, Mission, Target
 
 needs_torch = pytest.mark.skipif(
     any(find_spec(name) is None for name in requirements.MODULES), reason="the extra learned is not installed"

@@ -18,7 +18,8 @@ from ground_station.m3c2_change import M3C2MeshChange, surface_change
 from ground_station.reconstruction.reconstructor import Mesh
 from protocol.field import VirtualField
 from protocol.geometry import Floats
-from protocol.mission import Cylinder, Feedback, Target
+from protocol.map_settings import Cylinder, Feedback
+from protocol.mission import Target
 
 TARGET = Target(lower_m=(-1.0, -0.8, 0.0), upper_m=(1.1, 0.8, 0.9))
 FIELD = VirtualField.of(TARGET)

@@ -21,8 +21,9 @@ from ground_station.reconstruction.backends import make_reconstructor
 from ground_station.reconstruction.memory import MEGABYTE, needs
 from protocol.errors import ReconstructionError
 from protocol.field import VirtualField
+from protocol.map_settings import Camera, Reconstruction
 from protocol.messages import Keyframe
-from protocol.mission import Camera, Mission, Reconstruction, Target
+from protocol.mission import Mission, Target
 
 VIEWS_KEPT = 24
 

@@ -17,8 +17,9 @@ from ground_station.mapper import Mapper, MapState
 from protocol.depth_image import encode_depth
 from protocol.errors import StorageError
 from protocol.field import VirtualField
+from protocol.map_settings import Feedback, Reconstruction
 from protocol.messages import Keyframe
-from protocol.mission import Feedback, Mission, Reconstruction
+from protocol.mission import Mission
 
 FIELD = VirtualField.of(MISSION.target)
 CUT = 8

@@ -15,7 +15,8 @@ from faults.meshes import of_points
 from ground_station.mesh_change import GridMeshChange, count_vertices
 from protocol.field import VirtualField, cell_centres
 from protocol.geometry import Floats
-from protocol.mission import Feedback, Target
+from protocol.map_settings import Feedback
+from protocol.mission import Target
 
 TARGET = Target(lower_m=(-1.0, -0.8, 0.0), upper_m=(1.1, 0.8, 0.9))
 FIELD = VirtualField.of(TARGET)

@@ -10,7 +10,8 @@ from typing import Any, TypeAlias
 import pytest
 from pydantic import ValidationError
 
-from protocol.mission import Box, Camera, Feedback, Mission
+from protocol.map_settings import Camera, Feedback
+from protocol.mission import Box, Mission
 
 Place: TypeAlias = tuple[str | int, ...]
 

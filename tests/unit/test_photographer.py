@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from protocol.geometry import Floats, camera_rotation, rotation_vector
+from protocol.map_settings import Camera as CameraSettings
 from protocol.messages import Keyframe
-from protocol.mission import Camera as CameraSettings
 from protocol.mission import Drone, Mission, Simulation
 from sim_bridge.camera import Camera
 from sim_bridge.photographer import Photographer, Shot, Sight

@@ -17,7 +17,8 @@ from ground_station.reconstruction.plane_sweep import COST_MAX, RADIUS, PlaneSwe
 from ground_station.reconstruction.views import View
 from protocol.errors import ReconstructionError
 from protocol.geometry import Floats, Intrinsics, camera_rotation
-from protocol.mission import Box, Reconstruction
+from protocol.map_settings import Reconstruction
+from protocol.mission import Box
 
 CAMERA = Intrinsics.from_field_of_view(128, 72, 1.287)
 SPAN = DepthRange(nearest=0.6, farthest=2.4, typical=1.5)

@@ -20,7 +20,8 @@ from ground_station.rebuild.quality import QUALITIES, Quality
 from ground_station.rebuild.run import rebuilding_mission
 from ground_station.results import MISSION_FILE
 from protocol.errors import MissionError, ReconstructionError
-from protocol.mission import Reconstruction, Target
+from protocol.map_settings import Reconstruction
+from protocol.mission import Target
 
 QUICK = ("--set", "reconstruction.voxel_m=0.05", "--set", "reconstruction.sweep_width_px=96")
 

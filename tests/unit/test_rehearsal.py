@@ -9,7 +9,8 @@ import pytest
 from ground_station.m3c2_change import M3C2MeshChange
 from ground_station.mesh_change import GridMeshChange, MeshChange
 from ground_station.rehearsal import IMAGES, rehearse
-from protocol.mission import Camera, Drone, Feedback, Mission, Reconstruction
+from protocol.map_settings import Camera, Feedback, Reconstruction
+from protocol.mission import Drone, Mission
 
 DRONES = (Drone(id=1, start=(0.0, 0.0, 2.0, 0.0, 1.3)),)
 

@@ -18,7 +18,8 @@ from ground_station.replay.engine import Replay
 from protocol import messages
 from protocol.field import VirtualField
 from protocol.importance import ImportanceField
-from protocol.mission import Drone, Feedback, Mission, Target
+from protocol.map_settings import Feedback
+from protocol.mission import Drone, Mission, Target
 
 FLOWN = Mission(
     target=Target(lower_m=(-1, -1, 0), upper_m=(1, 1, 1), cell_m=0.5, cell_rad=0.8),

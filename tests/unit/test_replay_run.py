@@ -21,7 +21,8 @@ from ground_station.results import Metrics, Summary
 from protocol import messages
 from protocol.field import VirtualField
 from protocol.importance import ImportanceField
-from protocol.mission import Drone, Feedback, Mission, Reconstruction, Target
+from protocol.map_settings import Feedback, Reconstruction
+from protocol.mission import Drone, Mission, Target
 from protocol.replication import Integrated
 
 MISSION = Mission(

@@ -6,7 +6,8 @@ import pytest
 
 from ground_station.replay.settings import with_settings
 from protocol.errors import MissionError
-from protocol.mission import Cylinder, Drone, Mission
+from protocol.map_settings import Cylinder
+from protocol.mission import Drone, Mission
 
 FLOWN = Mission(drones=(Drone(id=1, start=(0, 0, 2, 0, 1.4)),))
 

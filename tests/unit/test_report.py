@@ -22,7 +22,8 @@ from ground_station.report.run_data import Mesh
 from ground_station.report.run_folder import load_run
 from ground_station.results import Metrics, RunFolder
 from protocol.errors import CovreconError, MissionError
-from protocol.mission import Drone, Feedback, Mission, Reconstruction
+from protocol.map_settings import Feedback, Reconstruction
+from protocol.mission import Drone, Mission
 
 SCORES = Scores(visible=Score.of(0.96, 0.8), exposed=Score.of(0.96, 0.7), objects=Score.of(0.9, 0.6))
 FLOOR = Scores(visible=Score.of(1.0, 0.5), exposed=Score.of(1.0, 0.4), objects=Score.of(0.0, 0.0))

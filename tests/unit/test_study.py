@@ -24,7 +24,8 @@ from ground_station.study.plan_file import FLIGHTS_FOLDER, Method, Plan, Planned
 from ground_station.study.statistics import Difference, Spread, paired_difference, spread_of
 from ground_station.study.tables import gain_rows, gain_text, gains_csv, method_rows, methods_csv, orders, spread_text
 from protocol.errors import CovreconError
-from protocol.mission import Drone, Feedback, Mission
+from protocol.map_settings import Feedback
+from protocol.mission import Drone, Mission
 
 DURATION_S = 30.0
 CORNERS = np.array(list(itertools.product((-3.0, 3.0), (-3.0, 3.0), (0.0,))), np.float32)

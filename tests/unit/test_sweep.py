@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from agents.planners.sweep import Footprint, Rectangle, divide, footprint_of, strip_centres, sweep
 from protocol.geometry import Floats, camera_rotation
-from protocol.mission import Camera
+from protocol.map_settings import Camera
 
 FOOTPRINT = Footprint(1.5, 0.84)
 lengths = st.floats(0.3, 12.0)

@@ -17,7 +17,8 @@ from protocol.formation import formation
 from protocol.geometry import camera_rotation
 from protocol.keyframe_rule import KeyframeRule
 from protocol.localization_settings import Localization
-from protocol.mission import Camera, Drone, Flight, Mission
+from protocol.map_settings import Camera
+from protocol.mission import Drone, Flight, Mission
 from protocol.mission_file import mission_to_toml
 from protocol.obstacle_settings import Obstacles
 from protocol.topics import TOPICS

@@ -7,7 +7,8 @@ import pytest
 import trimesh
 
 from protocol.errors import SceneError
-from protocol.mission import Camera, Drone, Flight, Mission, Target
+from protocol.map_settings import Camera
+from protocol.mission import Drone, Flight, Mission, Target
 from sim_bridge.scenes import truth as truth_module
 from sim_bridge.scenes.__main__ import main
 from sim_bridge.scenes.cropping import crop_to_box
