@@ -9,6 +9,7 @@ set, also when u is constant over a tick of length h <= 1/(2a): b falls at most 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -94,7 +95,10 @@ class Barriers:
         self._change = np.full(5, np.inf)
         if flight.response_time_s > 0:
             self._change = np.array(flight.acceleration_limits) * flight.response_time_s
-        self._gentle_change = np.array(flight.jerk_limits) * flight.response_time_s * mission.tick_s
+        self._gentle_change = np.array([
+            jerk * flight.response_time_s * mission.tick_s if math.isfinite(jerk) else math.inf
+            for jerk in flight.jerk_limits
+        ])  # fmt: skip
 
     def heed(self, obstacles: Obstacles) -> None:
         """From now on there are rows of these too."""

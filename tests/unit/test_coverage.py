@@ -12,7 +12,7 @@ import pytest
 from agents.barriers import FIXED_ROWS, Neighbour, Rows, predicted_pose
 from agents.planners.coverage import CoverageController
 from agents.planners.planner import Decision
-from agents.quadratic_program import Held, Outcome, Solution
+from agents.quadratic_program import Held, Outcome, Smoothing, Solution
 from protocol.field import VirtualField
 from protocol.geometry import Floats, optical_axis
 from protocol.importance import ImportanceField, SamplingTerms
@@ -40,9 +40,12 @@ class ScriptedProgram:
     strict_rows: int = 99
     asked: list[tuple[Floats, float, Rows]] = field(default_factory=list)
 
-    def solve(self, xi1: Floats, xi2: float, rows: Rows, low: Floats, high: Floats, held: Held) -> Solution:
+    def solve(
+        self, xi1: Floats, xi2: float, rows: Rows, low: Floats, high: Floats, held: Held, smoothing: Smoothing
+    ) -> Solution:
         assert (low <= high).all()
         assert not held.axes.any(), "the paper's controller leaves every axis to the sampling row"
+        assert smoothing.weight == 0, "nor does it smooth anything"
         self.asked.append((xi1, xi2, rows))
         return self.answer
 
