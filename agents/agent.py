@@ -433,7 +433,7 @@ class Agent:
             control=self._control,
             position_sd_m=telemetry.position_sd_m,
             angle_sd_rad=telemetry.angle_sd_rad,
-            climb_m=self._climb_m,
+            climb_m=self._climb_m or None,
         )
 
     def _report(self, tick: int, decision: Decision, sent: Floats, solve_s: float, age_s: float) -> None:

@@ -42,7 +42,7 @@ class Team:
         if state.drone != self._own and (known is None or known.tick <= state.tick):
             tick = min(state.tick, now + 1)
             self._last_seen[state.drone] = _Seen(
-                tick, state.pose, state.velocity, state.blind_s, state.landed, state.position_sd_m, state.climb_m
+                tick, state.pose, state.velocity, state.blind_s, state.landed, state.position_sd_m, state.climb_m or 0.0
             )
 
     def neighbours(

@@ -156,8 +156,8 @@ class DroneState(Message):
     """Of the position, along the direction in which it is largest: neighbours keep so much farther away ..."""
     angle_sd_rad: Deviation = 0.0
     """... and of the yaw and pitch."""
-    climb_m: Annotated[float, Field(ge=0, le=1e6)] = 0.0
-    """So far straight up its vehicle is about to climb by itself, without giving way."""
+    climb_m: Annotated[float, Field(gt=0, le=1e6)] | None = None
+    """So far straight up its vehicle is about to climb by itself, without giving way; None: it is not."""
 
     @property
     def landed(self) -> bool:
@@ -190,7 +190,7 @@ class TeamStates(Message):
     position_sd_m: WireArray | None = None
     """float64 (n,), as in `DroneState`; None of a router that does not know them."""
     climb_m: WireArray | None = None
-    """Likewise."""
+    """Likewise, 0 for those who are not about to."""
 
 
 class Keyframe(Message):

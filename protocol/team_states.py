@@ -52,7 +52,7 @@ def pack(states: Iterable[tuple[DroneState, Sequence[TimedPose]]]) -> TeamStates
         earlier_ticks=np.array([tick for _, tick, _ in earlier], np.int32),
         earlier_poses=_five([pose for _, _, pose in earlier]),
         position_sd_m=np.array([state.position_sd_m for state in newest], np.float64),
-        climb_m=np.array([state.climb_m for state in newest], np.float64),
+        climb_m=np.array([state.climb_m or 0.0 for state in newest], np.float64),
     )
 
 

@@ -108,6 +108,7 @@ EXAMPLES: tuple[Message, ...] = (
         importance=0.75,
         replica=REPLICA,
         control=CONTROL,
+        climb_m=1.5,
     ),
     Keyframe(
         drone=1,
@@ -372,7 +373,7 @@ def test_a_value_of_another_type_is_refused_wherever_it_stands(message: Message)
         others: list[object] = ["3", b"3", True, None, 2.5, 3, [], {}]
         same_kind = (int, float) if type(value) is float else (type(value),)
         for other in others:
-            if type(other) in same_kind or (other is None and place[-1] == "control"):
+            if type(other) in same_kind or (other is None and place[-1] in ("control", "climb_m")):
                 continue
             with pytest.raises(MessageError):
                 decode(type(message), replaced(fields, place, other))
