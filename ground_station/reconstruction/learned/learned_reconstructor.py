@@ -15,7 +15,6 @@ from typing import Final
 import numpy as np
 
 from ground_station.reconstruction.admission import Admission
-from ground_station.reconstruction.free_cells import seen_free
 from ground_station.reconstruction.fusion import Volume
 from ground_station.reconstruction.learned.fragment import (
     FINE_M,
@@ -95,7 +94,8 @@ class LearnedReconstructor:
         return extract_mesh(self._volume, WEIGHT_MIN)
 
     def free_cells(self, grid: ObstacleGrid) -> Cells:
-        return seen_free(self._volume, WEIGHT_MIN, grid)
+        """None: what a network takes for empty is a guess, and no drone shall fly into a guess."""
+        return np.zeros(grid.shape, np.bool_)
 
     def statistics(self) -> Statistics:
         return self._ledger.statistics(
