@@ -92,6 +92,7 @@ class Told:
 
 @pytest.mark.processes
 def test_three_drones_with_batteries_for_a_third_of_the_mission_finish_it_by_swapping(tmp_path: Path) -> None:
+    """Policy "battery reserve"."""
     path = tmp_path / "swap.toml"
     path.write_text(MISSION.format(scene=write_scene(tmp_path)))
     told = Told()

@@ -13,6 +13,7 @@ SCENARIOS = (
     Path("tests/scenario/test_px4_failures.py"),
     Path("tests/scenario/test_localization.py"),
     Path("tests/scenario/test_obstacle_flight.py"),
+    Path("tests/scenario/test_battery_swap.py"),
 )
 
 BATTERIES = "test_batteries_a_gimbal_and_a_pilot"
@@ -21,6 +22,7 @@ PROCESSES = "test_an_agent_stopped_one_killed_and_the_ground_station_lost"
 OPERATOR = "test_an_operator_pauses_returns_and_lands_drones"
 LOST = "test_drones_that_no_longer_know_where_they_are_hold_and_then_land"
 STALE = "test_drones_hold_while_no_map_of_free_cells_comes"
+SWAP = "test_three_drones_with_batteries_for_a_third_of_the_mission_finish_it_by_swapping"
 CUT = "test_the_others_fly_on_and_land_when_a_link_is_cut_for_good"
 
 SHOWN_BY = {
@@ -33,6 +35,7 @@ SHOWN_BY = {
     "position unsure": LOST,
     "mission end": PROCESSES,
     "battery low": BATTERIES,
+    "battery reserve": SWAP,
     "gimbal lost": BATTERIES,
     "ground station lost": PROCESSES,
     "telemetry stale": TELEMETRY,
