@@ -13,15 +13,15 @@ HALF_M = 2.8
 """Lanes end so far from the room's middle; the target box ends at 3 m."""
 LANE_M = (0.7, 1.1)
 """Range of the distance between neighbouring lanes; the study's lawnmower has 0.9 m."""
-HEIGHT_M = (1.1, 2.3)
-"""Range of a lane's height; with the drones' best distance of 1 m to what is up to 2 m high."""
+HEIGHT_M = (1.1, 2.9)
+"""Range of a lane's height: drones fly from 1 to 3 m, for their best distance is 1 m to what is up to 2 m high."""
 BOB_M = 0.25
 """Amplitude of the height along a lane."""
 STEEP_RAD = (math.pi / 3, math.pi / 2)
 """Range of the depression angle, the flight's own limits ..."""
 OBLIQUE_RAD = (math.pi / 6, math.radians(80))
 """... and that of missions which let cameras look ahead."""
-OBLIQUE_SHARE = 0.4
+OBLIQUE_SHARE = 0.3
 """Of sorties."""
 STEP_M = (0.12, 0.26)
 """Range of the distance between photographs: from every keyframe to every other."""
@@ -29,7 +29,7 @@ CLEARANCE_M = 0.3
 """To the nearest surface; a photograph from within a wardrobe teaches nothing."""
 CLIMB_M = 0.1
 """Step by which a place that is too near to something is raised ..."""
-CEILING_M = 2.8
+CEILING_M = 3.2
 """... and where that ends."""
 
 

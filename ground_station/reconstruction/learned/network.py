@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from ground_station.reconstruction.learned.fragment import COARSE, FINE_M, NEAREST_M
 
-ARCHITECTURE: Final = "dense-2-level/2"
+ARCHITECTURE: Final = "dense-2-level/3"
 """Changes with everything that makes old weights useless, also with the meaning of inputs and outputs."""
 
 IMAGE_WIDTH: Final = 256
@@ -28,9 +28,9 @@ QUARTER: Final = 20
 """Features of the quarter-size map, which fill the coarse volume ..."""
 HALF: Final = 12
 """... and of the half-size map, which refine; with what is shown in both."""
-IMAGE_WIDTHS: Final = (16, 24, 32)
-VOLUME_WIDTHS: Final = (24, 40, 64)
-REFINED_WIDTH: Final = 48
+IMAGE_WIDTHS: Final = (24, 48, 64)
+VOLUME_WIDTHS: Final = (48, 96, 160)
+REFINED_WIDTH: Final = 96
 GROUP: Final = 8
 """Channels that are normalised together; divides all widths."""
 CONTRAST_PX: Final = 9
