@@ -128,7 +128,7 @@ class Agent:
         self._poses = make_pose_source(mission, drone, bus, lockstep=lockstep)
         self._orders = Orders(mission, self._clock.now_s, self._news.tell)
         self._operator = DroneOrder(drone=drone, action="fly", number=0)
-        self._reserve = Reserve(mission, drone)
+        self._reserve = Reserve(mission, drone, self._obstacles)
         self._swap = Swap(mission, drone, self._news.tell)
         self._climb_m = 0.0
         self._feed = make_feed(mission, drone, bus, now_s=self._clock.now_s)

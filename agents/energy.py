@@ -12,7 +12,8 @@ from collections import deque
 
 import numpy as np
 
-from agents.homing import DESCENT_MPS
+from agents.homing import ARRIVED_M, DESCENT_MPS
+from agents.obstacles import Obstacles
 from agents.pathway import Pathway
 from agents.vehicles.vehicle import Telemetry
 from protocol.mission import Flight, Mission
@@ -36,8 +37,9 @@ def landing_s(flight: Flight, height_m: float) -> float:
 class Reserve:
     """Of one drone."""
 
-    def __init__(self, mission: Mission, drone: int) -> None:
-        self._flight, self._vehicles = mission.flight, mission.vehicles
+    def __init__(self, mission: Mission, drone: int, obstacles: Obstacles | None = None) -> None:
+        """``obstacles``: a way home leads up to above them, and down from there (`agents.homing`)."""
+        self._flight, self._vehicles, self._obstacles = mission.flight, mission.vehicles, obstacles
         self._home = np.array(mission.drone(drone).start)
         self._pathway = Pathway(mission.flight)
         ids = sorted(other.id for other in mission.drones)
@@ -87,10 +89,13 @@ class Reserve:
     def _home_s(self, telemetry: Telemetry) -> float:
         place, floor_m = telemetry.pose[:3], self._flight.lower_m[2]
         leg = self._pathway.leg(place, self._home[:2])
-        level_m, down_m = math.dist(place[:2], self._home[:2]), max(0.0, float(place[2]) - floor_m)
+        away_m, down_m = math.dist(place[:2], self._home[:2]), max(0.0, float(place[2]) - floor_m)
+        level_m, climb_m = away_m, 0.0
+        if self._obstacles is not None and away_m > ARRIVED_M:
+            climb_m = max(0.0, self._obstacles.clear_m - float(place[2]))
         if leg is not None:
             level_m, down_m = leg.left_m - leg.down_m, leg.down_m
-        return level_m / self._flight.speed_max_mps + landing_s(self._flight, floor_m + down_m)
+        return (level_m + climb_m) / self._flight.speed_max_mps + landing_s(self._flight, floor_m + down_m + climb_m)
 
     def _stagger(self, usable: float) -> float:
         """What keeps those who took off together from being away together: with their first battery, each goes home

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from agents.energy import LAST_METRES_S, LEARN_S, WINDOW_S, Reserve, landing_s
+from agents.obstacles import Obstacles
 from agents.vehicles.vehicle import Telemetry
 from faults.zones import PILLAR
 from protocol.battery_settings import Battery
 from protocol.mission import Drone, Flight, Mission, Simulation
+from protocol.obstacle_settings import Obstacles as ObstacleSettings
 from protocol.vehicle_settings import Vehicles
 
 HOME = (0.0, 0.0, 2.0, 0.0, 1.3)
@@ -97,6 +99,22 @@ def test_the_way_home_goes_around_zones() -> None:
         reserve.look(telemetry(0.6, 61.0, place))
     assert free.home_s == pytest.approx(3.0 / 0.5 + landing_s(FLIGHT, 2.0))
     assert around.home_s > free.home_s + 0.5
+
+
+def test_among_obstacles_the_way_home_leads_over_them() -> None:
+    among = FLIGHT.model_copy(update={"obstacles": ObstacleSettings(enabled=True, clear_above_m=2.0)})
+    obstacles = Obstacles(mission(among))
+    low, above, at_home = (3.0, 0.0, 1.0), (3.0, 0.0, 3.0), (0.0, 0.0, 1.0)
+    times = []
+    for heeded in (None, obstacles):
+        reserve = learned(Reserve(mission(among), 3, heeded), 0.004)
+        for k, place in enumerate((low, above, at_home)):
+            reserve.look(telemetry(0.6, 61.0 + k, place))
+            times.append(reserve.home_s)
+    climb_m = obstacles.clear_m - 1.0
+    assert climb_m > 1.0
+    assert times[3] == pytest.approx(times[0] + climb_m / 0.5 + climb_m / 0.3)
+    assert times[4:] == times[1:3], "above them, and at home, nothing is to be climbed"
 
 
 def test_without_swaps_everybody_keeps_the_same_reserve() -> None:
