@@ -28,8 +28,8 @@ def plan(
     """Say how long a mission takes, how many batteries each drone needs, and when it swaps them; and draw it.
 
     The mission is flown virtually: the same processes in lockstep, without images, as fast as it goes. Without images
-    the map's feedback does not raise J, which in flight takes longer. Exit code 1: it does not come to its J, or a
-    battery does not take its drone home.
+    the map's feedback does not raise J, and nothing is in the way; in flight it takes longer. Exit code 1: it does not
+    come to its J, or a battery does not take its drone home.
 
     ```
     covrecon plan my.toml                          # and the picture my-plan.png

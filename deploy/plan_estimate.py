@@ -91,8 +91,9 @@ class Plan:
 
 
 def virtual(mission: Mission) -> Mission:
-    """The same flight without images, in the internal simulator; batteries that say nothing of themselves are taken to
-    last for ``vehicles.battery_full_s`` where real vehicles fly."""
+    """The same flight without images, in the internal simulator, through an empty room: without images nothing would
+    ever be seen free. Batteries that say nothing of themselves are taken to last for ``vehicles.battery_full_s`` where
+    real vehicles fly."""
     raw = mission.model_dump()
     for table in ("transport", "localization", "metrics", "console", "start"):
         raw.pop(table)
@@ -101,6 +102,7 @@ def virtual(mission: Mission) -> Mission:
     raw["simulation"].update(scene="", estimate={})
     raw["reconstruction"] = {"backend": "none"}
     raw["feedback"]["method"] = "none"
+    raw["flight"]["obstacles"]["enabled"] = False
     if mission.vehicles.kind == "px4" and mission.simulation.battery.is_endless:
         hover_w = mission.simulation.battery.hover_w
         raw["simulation"]["battery"]["capacity_wh"] = hover_w * mission.vehicles.battery_full_s / JOULES_PER_WH

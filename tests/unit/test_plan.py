@@ -16,6 +16,7 @@ from ground_station.report.run_data import Flight, Run
 from protocol.battery_settings import Battery
 from protocol.errors import MissionError, ProcessError
 from protocol.mission import Drone, Mission, Simulation
+from protocol.obstacle_settings import Obstacles
 from protocol.vehicle_settings import Vehicles
 
 TICK_S = 0.05
@@ -110,6 +111,11 @@ def test_a_battery_that_cannot_reach_home_is_refused_before_the_flight() -> None
         MissionError, match=r"drone 2: 0\.5 Wh hover for 12 s.*its way down from 2 m.*cannot reach home"
     ):
         require_way_down(mission(Battery(capacity_wh=0.5)))
+
+
+def test_the_virtual_flight_goes_through_an_empty_room_for_without_images_nothing_would_be_seen_free() -> None:
+    among = mission().flight.model_copy(update={"obstacles": Obstacles(enabled=True)})
+    assert not virtual(mission().model_copy(update={"flight": among})).flight.obstacles.enabled
 
 
 def test_the_virtual_flight_has_no_images_and_carries_real_vehicles_by_the_simulator() -> None:
