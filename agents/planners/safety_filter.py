@@ -85,9 +85,10 @@ class SafetyFilter:
         return Decision(self.brake(rows, low, high), solution.outcome, 0.0, sampling, rows, ())
 
     def _set_up(self, strict_rows: int) -> None:
-        effort = self._mission.controller.effort_weight
-        self._program = QuadraticProgram(strict_rows, effort)
-        self._smooth_program = QuadraticProgram(strict_rows, effort, smooth=True)
+        settings = self._mission.controller
+        self._program = self._smooth_program = QuadraticProgram(strict_rows, settings.effort_weight)
+        if settings.smoothing > 0:
+            self._smooth_program = QuadraticProgram(strict_rows, settings.effort_weight, smooth=True)
 
     def steer(self, pose: Floats, velocity: Floats, neighbours: Sequence[Neighbour], wish: Floats = STAY) -> Decision:
         """The same program with another question: xi1 . u + xi2 >= 0 means "as fast as ``wish``, along it", and nothing
