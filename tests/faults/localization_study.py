@@ -22,6 +22,7 @@ import numpy as np
 from agents.localization.pose_filter import PoseFilter, largest_deviation
 from agents.localization.registration import MAP_SD_M, MAP_SD_RAD, ScanRegistration
 from faults.located_team import located
+from faults.measured_page import write_measured
 from faults.virtual_loop import run
 from ground_station.keyframe_log import NoKeyframes
 from ground_station.mapper import Mapper
@@ -51,7 +52,6 @@ NOISE = EstimateNoise(drift_m=0.05, drift_rad=0.01, velocity_mps=0.03, white_m=0
 """Of the vehicle: visual-inertial odometry or optical flow indoors. With KISS-ICP, of its velocity the same."""
 SECONDS = (60, 300)
 PAGE = Path("docs/localization.md")
-BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,9 +265,7 @@ def main(arguments: list[str]) -> None:
     folder = Path(arguments[0])
     folder.mkdir(parents=True, exist_ok=True)
     measured = tables(folder, int(arguments[1]) if len(arguments) > 1 else SECONDS[0])
-    before, _, rest = PAGE.read_text().partition(BEGIN)
-    _, _, after = rest.partition(END)
-    PAGE.write_text(f"{before}{BEGIN}\n{measured}\n{END}{after}")
+    write_measured(PAGE, measured)
     print(measured)
 
 

@@ -19,8 +19,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from faults.measured_page import write_measured
+
 PAGE = Path("docs/obstacles.md")
-BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 REACHED = 0.25
 SECONDS = 300.0
 DRONES = 4
@@ -145,9 +146,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _write(measured: str) -> None:
-    before, _, rest = PAGE.read_text().partition(BEGIN)
-    _, _, after = rest.partition(END)
-    PAGE.write_text(f"{before}{BEGIN}\n{measured}\n{END}{after}")
+    write_measured(PAGE, measured)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from faults.localization_study import SCENE, fly_and_map
+from faults.measured_page import write_measured
 from faults.team_flight import TeamFlight
 from protocol.geometry import Floats
 from protocol.map_settings import Feedback
@@ -44,7 +45,6 @@ DEAD_BAND_MPS = 0.05
 EXPOSURE_S = 0.02
 TRACE_S = 60.0
 PAGE, PICTURE = Path("docs/smooth-flight.md"), Path("docs/images/smooth-flight.png")
-BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 
 
 def team(count: int, seed: int) -> tuple[Drone, ...]:
@@ -248,9 +248,7 @@ def main(arguments: list[str]) -> None:
     folder = Path(arguments[0])
     folder.mkdir(parents=True, exist_ok=True)
     measured = tables(folder, maps="teams" not in arguments[1:])
-    before, _, rest = PAGE.read_text().partition(BEGIN)
-    _, _, after = rest.partition(END)
-    PAGE.write_text(f"{before}{BEGIN}\n{measured}\n{END}{after}")
+    write_measured(PAGE, measured)
     print(measured)
 
 
