@@ -12,7 +12,7 @@ import numpy as np
 from agents.barriers import FIXED_ROWS, OBSTACLE, SEPARATION, ZONE, Barriers, Neighbour, Rows, predicted_pose
 from agents.obstacles import Obstacles
 from agents.planners.planner import STAY, Decision
-from agents.quadratic_program import NOTHING_HELD, Held, QuadraticProgram, Smoothing
+from agents.quadratic_program import NOTHING_HELD, SECOND_TRY, SMOOTH, Held, QuadraticProgram, Smoothing
 from protocol.airspace import airspace_of
 from protocol.geometry import Floats
 from protocol.mission import Mission
@@ -80,6 +80,8 @@ class SafetyFilter:
         program = self._smooth_program if smoothing.weight > 0 else self._program
         gentle = self._barriers.gentle_bounds(self._before, rows, low, high)
         solution = program.solve(xi1, xi2, rows, *gentle, held, smoothing)
+        if solution.outcome in ("out_of_time", "numerical"):
+            solution = self._second_program.solve(xi1, xi2, rows, *gentle, held, smoothing)
         if solution.outcome == "solved":
             return Decision(solution.velocity, "solved", solution.slack, sampling, rows, solution.active)
         return Decision(self.brake(rows, low, high), solution.outcome, 0.0, sampling, rows, ())
@@ -87,8 +89,9 @@ class SafetyFilter:
     def _set_up(self, strict_rows: int) -> None:
         settings = self._mission.controller
         self._program = self._smooth_program = QuadraticProgram(strict_rows, settings.effort_weight)
+        self._second_program = QuadraticProgram(strict_rows, settings.effort_weight, SECOND_TRY)
         if settings.smoothing > 0:
-            self._smooth_program = QuadraticProgram(strict_rows, settings.effort_weight, smooth=True)
+            self._smooth_program = QuadraticProgram(strict_rows, settings.effort_weight, SMOOTH)
 
     def steer(self, pose: Floats, velocity: Floats, neighbours: Sequence[Neighbour], wish: Floats = STAY) -> Decision:
         """The same program with another question: xi1 . u + xi2 >= 0 means "as fast as ``wish``, along it", and nothing
@@ -98,19 +101,35 @@ class SafetyFilter:
         return self.solve(pose, velocity, neighbours, WISH_WEIGHT * along, -WISH_WEIGHT * speed)
 
     def brake(self, rows: Rows, low: Floats, high: Floats) -> Floats:
-        """Stop; or, where strict rows are broken already, undo that as fast as the vehicle can, unless another row
-        forbids it: away from the nearest neighbour first, else out of zones and obstacles, else back into the box and
-        the gimbal's range."""
-        for offset in [*self._from_others(rows), *self._out_of(rows, ZONE), *self._out_of(rows, OBSTACLE)]:
-            retreat: Floats = np.clip(offset * top_speed(self._mission.flight), low, high)
-            if _worsens_nothing(rows, retreat):
+        """Stop; or, where strict rows are broken already, undo that as fast as the vehicle can: away from the nearest
+        neighbour first, else out of zones and obstacles, else up past obstacles, else back into the box and the
+        gimbal's range. Where each of these would break another row at that speed, the one that may be flown fastest."""
+        slower: Floats = np.zeros(5)
+        for wish in self._retreats(rows):
+            retreat: Floats = np.clip(wish, low, high)
+            share = _allowed_share(rows, retreat)
+            if share == 1.0:
                 return retreat
+            if share * np.linalg.norm(retreat) > np.linalg.norm(slower):
+                slower = share * retreat
+        return slower
+
+    def _retreats(self, rows: Rows) -> Iterator[Floats]:
+        """Velocities (5,) that undo what is broken, the most urgent first."""
+        speed = top_speed(self._mission.flight)
+        for direction in [
+            *self._from_others(rows),
+            *self._out_of(rows, ZONE),
+            *self._out_of(rows, OBSTACLE),
+            *self._up_past(rows),
+        ]:
+            yield speed * direction
         inwards: Floats = np.zeros(5)
         for k in np.flatnonzero(rows.barriers[:FIXED_ROWS] < 0):
             axis = int(np.abs(rows.coefficients[k]).argmax())  # each of these rows is about one
             inwards[axis] = rows.bounds[k] / rows.coefficients[k, axis]
-        inwards = np.clip(inwards, low, high)
-        return inwards if _worsens_nothing(rows, inwards) else np.zeros(5)
+        if inwards.any():
+            yield inwards
 
     def _from_others(self, rows: Rows) -> Iterator[Floats]:
         """The direction (5,) away from the nearest neighbour, if it is too near."""
@@ -126,6 +145,15 @@ class SafetyFilter:
             for k in sorted(broken, key=lambda k: rows.barriers[k]):
                 yield from _directions(rows, [k])
 
+    def _up_past(self, rows: Rows) -> Iterator[Floats]:
+        """Upwards, slid along the obstacles that it is in: between two of them there may be no other way out."""
+        broken = [k for k in rows.of(OBSTACLE) if rows.barriers[k] < 0]
+        if broken:
+            up = np.array([0.0, 0.0, 1.0, 0.0, 0.0])
+            for k in sorted(broken, key=lambda k: rows.barriers[k]):
+                up -= min(0.0, float(rows.coefficients[k] @ up)) * rows.coefficients[k]
+            yield up
+
 
 def _directions(rows: Rows, chosen: list[int]) -> Iterator[Floats]:
     """The one in which the barriers of the ``chosen`` rows grow, of length 1; none if there is no such one."""
@@ -135,6 +163,9 @@ def _directions(rows: Rows, chosen: list[int]) -> Iterator[Floats]:
         yield growing / length
 
 
-def _worsens_nothing(rows: Rows, velocity: Floats) -> bool:
-    """Whether ``velocity`` (5,) meets every row that can be met, and takes no broken one further."""
-    return bool((rows.coefficients @ velocity >= np.minimum(rows.bounds, 0.0)).all())
+def _allowed_share(rows: Rows, velocity: Floats) -> float:
+    """The largest part of ``velocity`` (5,), 0 to 1, that meets every row that can be met and takes no broken one
+    further. Zero velocity does."""
+    growth, least = rows.coefficients @ velocity, np.minimum(rows.bounds, 0.0)
+    worse = growth < least
+    return float((least[worse] / growth[worse]).min()) if worse.any() else 1.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from agents.barriers import OBSTACLE, Barriers
 from agents.obstacle_rows import nearest_distance
 from agents.obstacles import Obstacles
 from agents.planners.safety_filter import SafetyFilter
+from agents.quadratic_program import QuadraticProgram, Solution
 from faults.seen_room import not_free, room_mission, rough_map
 from ground_station.console.constraints import all_in_words
 from protocol.geometry import Floats
@@ -123,6 +125,88 @@ def test_the_program_has_an_answer_that_meets_the_rows_however_rough_the_map(see
         assert (rows.coefficients @ decision.velocity >= rows.bounds - 1e-9).all()
         answers += decision.outcome == "solved"
     assert answers >= 18, "a drone held on all sides brakes, which is the answer there"
+
+
+@pytest.mark.parametrize(("seed", "count"), [(10, 37), (33, 37), (36, 29), (39, 46)])
+def test_a_program_that_the_solver_gives_up_is_asked_once_more_within_the_same_rows(
+    seed: int, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Random pulls beside rough maps; in each of these series the solver gives up at least once."""
+    mission = room_mission()
+    obstacles, rng = Obstacles(mission), np.random.default_rng(seed)
+    obstacles.free = rough_map(obstacles.grid, seed, 0.98) | obstacles.grid.vouched
+    planner = SafetyFilter(mission, 0)
+    planner.heed(obstacles)
+    outcomes: list[str] = []
+    solve = QuadraticProgram.solve
+
+    def noted(program: QuadraticProgram, *asked: Any) -> Solution:
+        found = solve(program, *asked)
+        outcomes.append(found.outcome)
+        return found
+
+    monkeypatch.setattr(QuadraticProgram, "solve", noted)
+    given_up = 0
+    for _ in range(count):
+        pose = np.array([*rng.uniform(mission.flight.lower_m, mission.flight.upper_m), 0.0, 1.3])
+        xi1 = rng.normal(size=5) * rng.choice([1.0, 10.0, 100.0, 1000.0], size=5)
+        outcomes.clear()
+        decision = planner.solve(pose, np.zeros(5), [], xi1, -0.5 * rng.uniform(0.2, 1.5) * np.abs(xi1).sum())
+        if outcomes[0] in ("out_of_time", "numerical"):
+            given_up += 1
+            assert decision.outcome == outcomes[1] == "solved"
+            assert (decision.rows.coefficients @ decision.velocity >= decision.rows.bounds - 1e-9).all()
+        else:
+            assert len(outcomes) == 1
+    assert given_up
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_braking_where_a_map_has_learned_of_something_worsens_nothing_and_leaves_it(seed: int) -> None:
+    mission = room_mission()
+    obstacles, rng = told(mission, seed, share=0.99), np.random.default_rng(seed)
+    planner, barriers = SafetyFilter(mission, 0), Barriers(mission)
+    planner.heed(obstacles)
+    barriers.heed(obstacles)
+    low, high = barriers.velocity_bounds(np.zeros(5))
+    inside = left = 0
+    for place in rng.uniform(mission.flight.lower_m, mission.flight.upper_m, (200, 3)):
+        rows = barriers.rows(np.array([*place, 0.0, 1.3]), [])
+        velocity = planner.brake(rows, low, high)
+        assert (rows.coefficients @ velocity >= np.minimum(rows.bounds, 0.0) - 1e-9).all()
+        if rows.margin(OBSTACLE, 0.0) < 0:
+            inside += 1
+            left += bool(velocity.any())
+        else:
+            assert not velocity.any()
+    assert inside > 10
+    assert left > 0.5 * inside, "amid many cells all ways out of some lead into others"
+
+
+@pytest.mark.parametrize("width", [4, 5, 6])
+def test_a_drone_in_a_gap_that_turned_out_too_narrow_leaves_it_upwards(width: int) -> None:
+    """Wider than the drone and narrower than its margins: no velocity meets both sides' rows."""
+    mission = room_mission()
+    obstacles, planner = Obstacles(mission), SafetyFilter(mission, 0)
+    planner.heed(obstacles)
+    grid = obstacles.grid
+    free = np.zeros(grid.shape, np.bool_)
+    free[20 : 20 + width] = True
+    free[:, :, 10:] = True
+    obstacles.free = free
+    pose = np.array([*(grid.origin + grid.cell_m * np.array([20.2 + width / 2, 20.0, 7.0])), 0.0, 1.3])
+    assert width * grid.cell_m < 2 * obstacles.kept_m
+
+    outcomes, sides = set(), []
+    for _ in range(200):
+        decision = planner.steer(pose, np.zeros(5), [])
+        outcomes.add(decision.outcome)
+        sides.append(obstacles.margin(pose[:3], 3.0))
+        pose = pose + mission.tick_s * decision.velocity
+
+    assert "infeasible" in outcomes
+    assert min(sides) >= sides[0] - 1e-6, "and it never comes nearer to anything"
+    assert obstacles.margin(pose[:3], 3.0) >= -1e-3
 
 
 def test_a_drone_where_something_was_seen_after_all_leaves_upwards() -> None:

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from agents.barriers import FIXED_ROWS, Barriers, Neighbour, Rows, widened_separation
 from agents.planners.coverage import CoverageController
 from agents.planners.safety_filter import SafetyFilter
-from agents.quadratic_program import QuadraticProgram, Smoothing
+from agents.quadratic_program import SMOOTH, QuadraticProgram, Smoothing
 from faults.team_flight import TeamFlight
 from protocol.geometry import Floats
 from protocol.importance import SamplingTerms
@@ -51,7 +51,7 @@ def is_safe(rows: Rows) -> bool:
 
 
 def free(xi2: float, smoothing: float, flown: Floats) -> Floats:
-    found = QuadraticProgram(ROOM, 0.01, smooth=True).solve(
+    found = QuadraticProgram(ROOM, 0.01, SMOOTH).solve(
         np.full(5, 100.0),
         xi2,
         BARRIERS.rows(MIDDLE, []),
@@ -93,7 +93,7 @@ def test_smooth_programs_are_solved_within_the_strict_rows_wherever_standing_sti
     rows = BARRIERS.rows(pose, others(pose, chosen))
     low, high = BARRIERS.velocity_bounds(flown)
 
-    found = QuadraticProgram(ROOM, 0.01, smooth=True).solve(xi1, xi2, rows, low, high, smoothing=Smoothing(0.15, flown))
+    found = QuadraticProgram(ROOM, 0.01, SMOOTH).solve(xi1, xi2, rows, low, high, smoothing=Smoothing(0.15, flown))
 
     if is_safe(rows):
         assert found.outcome == "solved"
@@ -106,7 +106,7 @@ def test_smooth_programs_are_solved_within_the_strict_rows_wherever_standing_sti
 def test_a_pitch_row_beside_the_bound_of_the_pitch_rate_does_not_stop_the_solver() -> None:
     """Of a flight: the row says 0.4981, the bound 0.5, and the solver went to and fro between them for 16 s."""
     low, high = Flight().pitch_limits_rad
-    program = QuadraticProgram(ROOM, 0.01, smooth=True)
+    program = QuadraticProgram(ROOM, 0.01, SMOOTH)
     outcomes = []
     for away in np.linspace(-0.12, 0.12, 241):
         rows = BARRIERS.rows(np.array([-0.5, 0.2, 2, 0, (low + high) / 2 + away]), [])
@@ -122,7 +122,7 @@ def test_a_pitch_row_beside_the_bound_of_the_pitch_rate_does_not_stop_the_solver
 
 def test_rows_that_cannot_hold_together_are_told_with_smoothing_too() -> None:
     rows = BARRIERS.rows(np.array([9.0, 0, 2, 0, 1.31]), [])  # 5 m outside: 5 m/s are asked for, 0.5 allowed
-    found = QuadraticProgram(ROOM, 0.01, smooth=True).solve(
+    found = QuadraticProgram(ROOM, 0.01, SMOOTH).solve(
         np.ones(5), -1.0, rows, np.full(5, -0.5), np.full(5, 0.5), smoothing=Smoothing(0.1, np.zeros(5))
     )
     assert found.outcome == "infeasible"
