@@ -10,7 +10,6 @@ in FOLDER already is not flown again, so a study goes on where it was broken off
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import subprocess
 import sys
@@ -92,13 +91,12 @@ def fly(room: int, *, enabled: bool, seconds: float, folder: Path) -> Flight:
 def _figures(run: Path) -> dict[str, Any]:
     """Of a run's folder, as `Flight` has them."""
     summary = json.loads((run / "summary.json").read_text())
-    with (run / "metrics.csv").open() as rows:
-        times = [float(row["time_s"]) for row in csv.DictReader(rows) if float(row["importance"]) < REACHED]
+    reached = summary["exit_reason"] == f"importance fell below {REACHED:g}"
     return {
         "contacts": sum(summary["contacts"].values()),
         "min_separation_m": summary["min_separation_m"],
         "importance": summary["J"],
-        "reached_s": times[0] if times else None,
+        "reached_s": summary["sim_time_s"] if reached else None,
         "fallbacks": sum(summary["fallbacks"].values()),
         "f_score_visible": summary["f_score_visible"],
     }
