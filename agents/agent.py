@@ -363,11 +363,17 @@ class Agent:
 
     def _decide(self, telemetry: Telemetry, tick: Tick, mode: Mode, terms: SamplingTerms) -> Decision:
         neighbours = self._neighbours(telemetry, tick.tick)
+        self._planner.note_deviation(telemetry.position_sd_m)
         if self._obstacles is not None:
             self._obstacles.advance(tick.tick, telemetry.position_sd_m)
         if mode in ("returning", "landing"):
             return self._homecoming.steer(
-                telemetry.pose, telemetry.velocity, neighbours, home=mode == "returning", now_s=self._clock.now_s()
+                telemetry.pose,
+                telemetry.velocity,
+                neighbours,
+                home=mode == "returning",
+                now_s=self._clock.now_s(),
+                deviation_m=telemetry.position_sd_m,
             )
         if mode in ("joining", "holding"):
             self._put_off()

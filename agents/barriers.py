@@ -17,10 +17,10 @@ import numpy as np
 from numba import njit
 
 from agents.obstacles import Obstacles
-from protocol.airspace import airspace_of
+from protocol.airspace import airspace_within
 from protocol.geometry import Floats
 from protocol.mission import Flight, Mission
-from protocol.separation import top_speed, widened_separation
+from protocol.separation import error_beyond, top_speed, widened_separation
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,12 +82,13 @@ class Barriers:
         low, high = flight.pitch_limits_rad
         self._pitch_mid, self._pitch_reach = (low + high) / 2, ((high - low) / 2) ** 2
         self._pitch_gain, self._gain = controller.pitch_gain_per_s, controller.separation_gain_per_s
-        self._faces = np.concatenate([flight.lower_m, np.negative(flight.upper_m)])
+        self._box = self._faces = np.concatenate([flight.lower_m, np.negative(flight.upper_m)])
         self._region = np.zeros((FIXED_ROWS, 5))
         self._region[1:4, :3], self._region[4:7, :3] = np.eye(3), -np.eye(3)
         self._flight = flight
         self._wide, self._top_speed = widened_separation(flight), top_speed(flight)
-        self._airspace = airspace_of(flight)
+        self._deviation_m = 0.0
+        self._airspace = airspace_within(flight, self._deviation_m)
         self._obstacles: Obstacles | None = None
         # A zone that is farther away is no limit: not even at top speed does its barrier shrink as fast as it may.
         self._reach_m = self._top_speed / self._gain
@@ -104,16 +105,26 @@ class Barriers:
         """From now on there are rows of these too."""
         self._obstacles = obstacles
 
+    def note_deviation(self, deviation_m: float) -> None:
+        """Standard deviation of the own position from now on: box, boundary and zones are kept from the farther, the
+        more it may be off beyond what the mission says (docs/adr/0025)."""
+        if deviation_m != self._deviation_m:
+            self._deviation_m = deviation_m
+            self._faces = self._box + error_beyond(self._flight, deviation_m)
+            self._airspace = airspace_within(self._flight, deviation_m)
+
     def rows(self, predicted: Floats, neighbours: Sequence[Neighbour]) -> Rows:
         """All strict rows at the predicted pose (5,).
 
         pitch: b = ((max - min) / 2)^2 - (pitch - mid)^2 (ARCHITECTURE.md, departure 2).
-        region: b = distance inside each of the six faces.
+        region: b = distance inside each of the six faces, less what the own estimate may be off beyond what the
+        mission says.
         separation:<id>: one per neighbour (departure 7), b = |dy|^2 - D^2. Each drone's own velocity may shrink b by
         gain b; two that approach each other shrink it by twice that, and it still never becomes negative. A neighbour
         that has been silent for ``age`` keeps its place, and D grows by ``age`` times its top speed; and by what the
         two estimates may be off beyond what the mission says.
-        zone:<name>: one per convex part of a zone that may be a limit, b = distance from it less D.
+        zone:<name>: one per convex part of a zone that may be a limit, b = distance from it less D, which grows as the
+        box shrinks.
         obstacle:<n>: one per box of cells that are not free and may be a limit (`agents.obstacle_rows`).
         """
         positions = np.array([neighbour.position for neighbour in neighbours]).reshape(-1, 3)

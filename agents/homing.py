@@ -21,6 +21,7 @@ from agents.planners.planner import Decision, Planner
 from agents.way_up import WayUp
 from protocol.geometry import Floats
 from protocol.mission import Mission
+from protocol.separation import error_beyond
 
 ARRIVED_M = 0.2
 """Horizontal distance from home at which it is reached."""
@@ -56,15 +57,24 @@ class Homecoming:
         """Whether the vehicle is to land by itself now; it is never taken back."""
 
     def steer(
-        self, pose: Floats, velocity: Floats, neighbours: Sequence[Neighbour], *, home: bool, now_s: float
+        self,
+        pose: Floats,
+        velocity: Floats,
+        neighbours: Sequence[Neighbour],
+        *,
+        home: bool,
+        now_s: float,
+        deviation_m: float = 0.0,
     ) -> Decision:
-        """``pose`` and ``velocity`` (5,); ``home``: at the start's place instead of here."""
+        """``pose`` and ``velocity`` (5,); ``home``: at the start's place instead of here; ``deviation_m``: of the
+        pose's position, which keeps a drone so much farther from zones and from the floor."""
+        beyond_m = error_beyond(self._flight, deviation_m)
         distance, speed = self._flight.estimated_separation_m, self._flight.speed_max_mps
         away_m = math.dist(pose[:2], self._home[:2]) if home else 0.0
         ascent = self._way_up.ascent(pose[:3]) if self._way_up is not None and away_m > ARRIVED_M else None
         leg = None
         if ascent is None:
-            leg = self._pathway.leg(pose[:3], np.array(self._home[:2]) if home else None)
+            leg = self._pathway.leg(pose[:3], np.array(self._home[:2]) if home else None, beyond_m)
         if ascent is not None:
             wish = towards(pose[:3], ascent.end, speed)
         elif leg is not None:
@@ -76,7 +86,7 @@ class Homecoming:
         decision = self._planner.steer(pose, velocity, neighbours, wish)
         height = float(pose[2]) - self._flight.lower_m[2]
         down = ascent is None and leg is None
-        self.landing = self.landing or bool(down and height < TOUCHDOWN_M and wish[2] < 0)
+        self.landing = self.landing or bool(down and height < TOUCHDOWN_M + beyond_m and wish[2] < 0)
         left_m = height + away_m
         if leg is not None:
             left_m = leg.left_m

@@ -40,9 +40,10 @@ class Pathway:
         self._way: list[Floats] = []
         self._wait = 0
 
-    def leg(self, place: Floats, goal: Floats | None) -> Leg | None:
+    def leg(self, place: Floats, goal: Floats | None, beyond_m: float = 0.0) -> Leg | None:
         """The next leg from ``place`` (3,) to above ``goal`` (2,), or to where one may come down; None where that lies
-        straight ahead, or where there is no way.
+        straight ahead, or where there is no way. ``beyond_m``: how much farther from zones the drone keeps now than
+        ways do: it passes their corners at that distance, and so turns earlier.
 
         Straight ahead is: nothing is in the way to above the goal, nor from there down.
         """
@@ -56,7 +57,7 @@ class Pathway:
         if wanted != self._goal:
             self.forget()
         self._goal = wanted
-        while len(self._way) > 1 and self._is_passed(routes, place):
+        while len(self._way) > 1 and self._is_passed(routes, place, beyond_m):
             del self._way[0]
         if not self._way or not _may_fly(routes, place, self._way[0]):
             self._look(routes, place, goal)
@@ -76,9 +77,9 @@ class Pathway:
             self._way = routes.way(place, goal) or []
             self._wait = 0 if self._way else AGAIN_TICKS
 
-    def _is_passed(self, routes: Routes, place: Floats) -> bool:
+    def _is_passed(self, routes: Routes, place: Floats, beyond_m: float) -> bool:
         first, second = self._way[:2]
-        return math.dist(place, first) < REACHED_M and _may_fly(routes, place, second)
+        return math.dist(place, first) < REACHED_M + beyond_m and _may_fly(routes, place, second)
 
 
 def _is_straight(routes: Routes, place: Floats, goal: Floats | None) -> bool:

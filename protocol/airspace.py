@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -28,7 +28,7 @@ import numpy as np
 from protocol.geometry import Floats
 from protocol.polygons import Piece, convex_hull, convex_pieces, pockets
 from protocol.prisms import Counts, Flags, flat_distances, least_distances, near_zones
-from protocol.separation import top_speed, widened
+from protocol.separation import error_beyond, top_speed, widened
 from protocol.zone_settings import BOUNDARY
 
 if TYPE_CHECKING:
@@ -138,6 +138,18 @@ def _too_near(zone: str, barrier_m: float, kept_m: float) -> str:
         f"lies {where} {in_words(zone)}; drones keep {kept_m:.2f} m from it,"
         " flight.clearance_m and what lag and position_error_m add"
     )
+
+
+def airspace_within(flight: Flight, deviation_m: float) -> Airspace:
+    """The zones of ``flight`` to a drone that tells this standard deviation of its position: the same, with d grown by
+    what it may be off more than the mission says."""
+    airspace = airspace_of(flight)
+    beyond = error_beyond(flight, deviation_m)
+    if beyond <= 0.0:
+        return airspace
+    distance = airspace.distance_m + beyond
+    wide = widened(distance, top_speed(flight) * flight.response_time_s)
+    return replace(airspace, distance_m=distance, wide_m=wide, sides=airspace.sides - np.array([0.0, 0.0, beyond]))
 
 
 @lru_cache(maxsize=64)

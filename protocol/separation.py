@@ -25,6 +25,11 @@ def position_error(flight: Flight, deviation_m: float) -> float:
     return max(flight.position_error_m, SIGMAS * deviation_m)
 
 
+def error_beyond(flight: Flight, deviation_m: float) -> float:
+    """How much more that is than the mission says: by so much the margins of all that stands still grow."""
+    return position_error(flight, deviation_m) - flight.position_error_m
+
+
 def widened_separation(flight: Flight, beyond_m: float = 0.0) -> float:
     """Separation D of predicted positions that keeps the drones' positions d apart, metres; d is
     ``estimated_separation_m`` and ``beyond_m``, by which two estimates may be off more than that says, and two drones

@@ -27,6 +27,9 @@ class FilteredPlanner(ABC):
     def heed(self, obstacles: Obstacles) -> None:
         self._filter.heed(obstacles)
 
+    def note_deviation(self, deviation_m: float) -> None:
+        self._filter.note_deviation(deviation_m)
+
     @abstractmethod
     def decide(
         self, pose: Floats, velocity: Floats, neighbours: Sequence[Neighbour], terms: SamplingTerms, cells: float

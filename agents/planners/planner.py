@@ -38,6 +38,11 @@ class Planner(Protocol):
         """There is a map of free cells, and it is kept up to date: what is not free is behind strict rows too."""
         ...
 
+    def note_deviation(self, deviation_m: float) -> None:
+        """Standard deviation of the own position, from now on: the strict rows of box, boundary and zones keep so much
+        farther away. Neighbours and obstacles come with theirs."""
+        ...
+
     def note_team(self, drones: Sequence[int], poses: Floats) -> None:
         """One tick of phi was integrated with these ``drones``, ascending by id, at ``poses`` (drones, 5)."""
         ...

@@ -43,6 +43,10 @@ class SafetyFilter:
         self._barriers.heed(obstacles)
         self._set_up(self._program.strict_rows + OBSTACLE_ROWS)
 
+    def note_deviation(self, deviation_m: float) -> None:
+        """Standard deviation of the own position from now on."""
+        self._barriers.note_deviation(deviation_m)
+
     def solve(
         self,
         pose: Floats,
