@@ -46,6 +46,7 @@ from protocol.errors import ProcessError
 from protocol.geometry import Floats
 from protocol.importance import SamplingTerms, compile_kernels
 from protocol.messages import (
+    UNLIMITED,
     Control,
     DroneOrder,
     DroneState,
@@ -83,8 +84,6 @@ LOST_S = 60.0
 """After the mission, an agent speaks for a vehicle that is lost until the others are down."""
 LANDED_TICKS = 20
 """How often a drone says that it stands on the ground before its process ends: the others need not wonder."""
-UNLIMITED = 1e9
-"""Margin reported where there is no such row; a finite number, because infinities do not travel."""
 
 
 class Guard(AbstractContextManager["Guard"], Protocol):
@@ -462,6 +461,7 @@ class Agent:
             fallbacks=self._fallbacks,
             refused=self._bus.statistics.unused + self._replication.refused,
             telemetry_age_s=age_s,
+            obstacle_margin_m=rows.margin("obstacle", UNLIMITED),
         )
 
 

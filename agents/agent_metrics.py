@@ -9,7 +9,7 @@ from prometheus_client import CollectorRegistry, Counter, Histogram
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from protocol.messages import Control, DroneState, Mode
+from protocol.messages import UNLIMITED, Control, DroneState, Mode
 
 SOLVE_BUCKETS_S = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
 """From a quarter of what a decision takes to two ticks of 20 Hz."""
@@ -77,6 +77,12 @@ def _of_control(control: Control) -> Iterator[Metric]:
     yield GaugeMetricFamily(
         "covrecon_agent_slack", "w of the quadratic program; above 0 it falls short.", control.slack
     )
+    if control.obstacle_margin_m < UNLIMITED:
+        yield GaugeMetricFamily(
+            "covrecon_agent_obstacle_margin_meters",
+            "Smallest barrier of what was not seen free; negative: too near to it.",
+            control.obstacle_margin_m,
+        )
     yield CounterMetricFamily(
         "covrecon_agent_refused_messages", "Messages refused, not handled or without room.", control.refused
     )

@@ -4,8 +4,9 @@
 * ``metrics.csv``: one row a second, readable while the run goes on and after it was killed.
 * ``trajectories.npz``: ``drones`` ids (D,), ``tick`` and ``time_s`` (T,), ``poses`` (T, D, 5), NaN where a drone was
   not heard; of the controllers, (T, D), ``solve_time_s``, ``slack``, ``telemetry_age_s``, ``separation_margin_m2``,
-  ``region_margin_m``, ``pitch_margin_rad2`` and ``fallback``: why the drone braked, or ""; of the vehicles, (T, D),
-  ``mode`` ("" where not heard) and ``battery`` (0 to 1). Ticks between the last checkpoint and a crash are missing.
+  ``region_margin_m``, ``pitch_margin_rad2``, ``obstacle_margin_m`` and ``fallback``: why the drone braked, or ""; of
+  the vehicles, (T, D), ``mode`` ("" where not heard), ``battery`` (0 to 1) and ``position_sd_m``. Ticks between the
+  last checkpoint and a crash are missing.
 * ``phi.npz``: the final importance ``phi`` float32 (positions, directions), and its lattice: ``xs``, ``ys``, ``zs`` in
   metres, position number = (ix * len(ys) + iy) * len(zs) + iz, and ``directions`` (directions, 3), unit vectors.
 * ``mesh.ply``, ``mesh.glb``: the map with vertex colours; PLY in the world frame, GLB with y up as glTF demands.
@@ -106,6 +107,10 @@ class Summary:
     """Keyframes that were left out of the map because their poses were too bad."""
     contacts: Mapping[int, int] | None = None
     """How often each simulated vehicle began to touch the scene; None where no simulator tells."""
+    min_obstacle_margin_m: float | None = None
+    """Smallest barrier of what was not seen free, of any drone at any tick; None where there was no such row."""
+    fallbacks_among_obstacles: Mapping[int, int] | None = None
+    """Those ``fallbacks`` in which there was one; None in missions without obstacles."""
 
     def as_json(self) -> dict[str, Any]:
         """The content of summary.json: flat where runs are compared, ``null`` for what the run did not have."""
@@ -120,14 +125,16 @@ class Summary:
             "min_separation_m": _rounded(self.min_separation_m),
             "jumps": self.final.jumps,
             "keyframes": self.final.keyframes,
-            "fallbacks": {str(drone): count for drone, count in self.fallbacks.items()},
+            "fallbacks": _by_drone(self.fallbacks),
             "ticks": self.final.tick,
             "sim_time_s": _rounded(self.final.time_s),
             "wall_time_s": _rounded(self.wall_time_s),
             "feedback_update_s": _rounded(self.feedback_update_s),
             **_pose_figures(self.pose_errors),
             "keyframes_unlocated": self.unlocated,
-            "contacts": None if self.contacts is None else {str(drone): n for drone, n in self.contacts.items()},
+            "contacts": _by_drone(self.contacts),
+            "min_obstacle_margin_m": _rounded(self.min_obstacle_margin_m),
+            "fallbacks_among_obstacles": _by_drone(self.fallbacks_among_obstacles),
             "phi_sha256": self.phi_sha256,
             "mesh_sha256": self.mesh_sha256,
             "versions": dict(self.versions),
@@ -307,6 +314,7 @@ class RunFolder:
             self._trajectories.write(self.path / TRAJECTORIES_FILE)
         except OSError as error:
             raise _storage_error(self.path, error) from error
+        flown, among_obstacles = self._trajectories, self._mission.flight.obstacles.enabled
         summary = Summary(
             mission=self._mission.name,
             seed=self._mission.seed,
@@ -315,7 +323,7 @@ class RunFolder:
             final=final,
             floor_baseline=floor_baseline,
             min_separation_m=self.min_separation_m,
-            fallbacks=self._trajectories.fallbacks(),
+            fallbacks=flown.fallbacks(),
             wall_time_s=wall_time_s,
             phi_sha256=phi_sha256,
             mesh_sha256=self._mesh_sha256,
@@ -324,6 +332,8 @@ class RunFolder:
             pose_errors=pose_errors,
             unlocated=unlocated,
             contacts=contacts,
+            min_obstacle_margin_m=flown.min_obstacle_margin_m(),
+            fallbacks_among_obstacles=flown.fallbacks_among_obstacles() if among_obstacles else None,
         )
         text = json.dumps(summary.as_json(), indent=2, allow_nan=False) + "\n"
         self._replace(SUMMARY_FILE, text.encode())
@@ -360,6 +370,10 @@ def _columns(drones: Sequence[int]) -> list[str]:
         "time_s", "tick", "importance", "f_score_visible", "f_score_exposed", "f_score_objects", "precision", "recall",
         "jumps", "keyframes", "min_separation_m", *(f"separation_{drone}_m" for drone in drones),
     ]  # fmt: skip
+
+
+def _by_drone(counts: Mapping[int, int] | None) -> dict[str, int] | None:
+    return None if counts is None else {str(drone): count for drone, count in counts.items()}
 
 
 def _flat(scores: Scores | None) -> dict[str, float | None]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ground_station.durable import replace_file
-from protocol.messages import Control, DroneState
+from protocol.messages import UNLIMITED, Control, DroneState
 
 COORDINATES = 5
 """x, y, z in metres, yaw and pitch in radians."""
@@ -24,9 +24,13 @@ UNREADABLE = (OSError, RuntimeError, KeyError, EOFError, struct.error, zlib.erro
 
 _OF_CONTROL = (
     "solve_time_s", "slack", "telemetry_age_s", "separation_margin_m2", "region_margin_m", "pitch_margin_rad2",
+    "obstacle_margin_m",
 )  # fmt: skip
 _UNDECIDED = (math.nan,) * len(_OF_CONTROL)
-_ADDED_LATER = ("mode", "battery", "separation_margin_m2", "region_margin_m", "pitch_margin_rad2")
+_ADDED_LATER = (
+    "mode", "battery", "separation_margin_m2", "region_margin_m", "pitch_margin_rad2", "obstacle_margin_m",
+    "position_sd_m",
+)  # fmt: skip
 """Files that were written before these were kept lack them."""
 
 
@@ -55,7 +59,8 @@ class Trajectories:
         braked = ["" if control is None or control.outcome == "solved" else control.outcome for control in controls]
         modes = ["" if state is None else state.mode for state in heard]
         batteries = [math.nan if state is None else state.battery for state in heard]
-        self._rows.append((tick, time_s, pose_row, numbers, braked, modes, batteries))
+        deviations = [math.nan if state is None else state.position_sd_m for state in heard]
+        self._rows.append((tick, time_s, pose_row, numbers, braked, modes, batteries, deviations))
 
     def write(self, path: Path) -> None:
         """Write all that is flown by now. Raises OSError."""
@@ -81,6 +86,18 @@ class Trajectories:
         braked = np.count_nonzero(self._settled()["fallback"] != "", axis=0)
         return dict(zip(self._drones, braked.tolist(), strict=True))
 
+    def fallbacks_among_obstacles(self) -> dict[int, int]:
+        """Those in which what was not seen free was so near that it could be a limit."""
+        flown = self._settled()
+        braked = np.count_nonzero((flown["fallback"] != "") & (flown["obstacle_margin_m"] < UNLIMITED), axis=0)
+        return dict(zip(self._drones, braked.tolist(), strict=True))
+
+    def min_obstacle_margin_m(self) -> float | None:
+        """The smallest of all; None where there never was one."""
+        margins = self._settled()["obstacle_margin_m"]
+        margins = margins[margins < UNLIMITED]  # NaN is not
+        return float(margins.min()) if margins.size else None
+
     def _settled(self) -> Mapping[str, NDArray[Any]]:
         """All rows as arrays; those added since the last time are converted now."""
         count = len(self._rows)
@@ -91,7 +108,9 @@ class Trajectories:
         return self._flown
 
     def _as_arrays(self, rows: Sequence[tuple[Any, ...]]) -> dict[str, NDArray[Any]]:
-        ticks, times, poses, numbers, fallbacks, modes, batteries = zip(*rows, strict=True) if rows else ((),) * 7
+        ticks, times, poses, numbers, fallbacks, modes, batteries, deviations = (
+            zip(*rows, strict=True) if rows else ((),) * 8
+        )
         shape = (len(rows), len(self._drones))
         of_control = np.moveaxis(np.array(numbers, np.float64).reshape(*shape, len(_OF_CONTROL)), -1, 0)
         return {
@@ -102,6 +121,7 @@ class Trajectories:
             "fallback": np.array(fallbacks, dtype=np.str_).reshape(shape),
             "mode": np.array(modes, dtype=np.str_).reshape(shape),
             "battery": np.array(batteries, dtype=np.float64).reshape(shape),
+            "position_sd_m": np.array(deviations, dtype=np.float64).reshape(shape),
         }
 
 
@@ -121,7 +141,7 @@ def read_trajectories(path: Path) -> dict[str, NDArray[Any]]:
         shape = (len(flown["tick"]), len(flown["drones"]))
         for name in _ADDED_LATER:
             flown.setdefault(name, np.full(shape, "" if name == "mode" else math.nan))
-        for name in ("poses", *_OF_CONTROL, "fallback", "mode", "battery"):
+        for name in ("poses", *_OF_CONTROL, "fallback", "mode", "battery", "position_sd_m"):
             if flown[name].shape[:2] != shape:
                 raise ValueError(f"damaged: {name} is of shape {flown[name].shape}")
     except UNREADABLE as error:
@@ -138,4 +158,5 @@ def _numbers(control: Control) -> tuple[float, ...]:
         control.separation_margin_m2,
         control.region_margin_m,
         control.pitch_margin_rad2,
+        control.obstacle_margin_m,
     )

@@ -19,6 +19,8 @@ Vector5 = tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate]
 """x, y, z, camera yaw, camera pitch (depression), or their rates."""
 Deviation = Annotated[float, Field(ge=0, le=1e6)]
 """Standard deviation, in metres or radians; 0 where nobody tells one."""
+UNLIMITED = 1e9
+"""Margin of a kind of row that a drone has none of; a finite number, because infinities do not travel."""
 EventLevel = Literal["info", "warning", "error"]
 Text = Annotated[str, Field(max_length=1000)]
 Outcome = Literal["solved", "infeasible", "out_of_time", "numerical", "none"]
@@ -110,6 +112,9 @@ class Control(Message):
     """Messages that this process refused, had no room for or failed on so far."""
     telemetry_age_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     """Of what the decision was made by."""
+    obstacle_margin_m: Finite = UNLIMITED
+    """Like the region's among the rows of what was not seen free; negative also where a map has just learned of
+    something beside the drone."""
 
 
 class ReplicaState(Message):

@@ -59,6 +59,7 @@ def state(drone: int) -> DroneState:
         fallbacks=12,
         refused=0,
         telemetry_age_s=0.0123,
+        obstacle_margin_m=0.456,
     )
     return DroneState(
         drone=drone,

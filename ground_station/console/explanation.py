@@ -191,6 +191,7 @@ def _figures(control: Control) -> Iterator[str]:
     margins = {
         f"separation {control.separation_margin_m2:.2f} m²": control.separation_margin_m2,
         f"region {control.region_margin_m:.2f} m": control.region_margin_m,
+        f"obstacles {control.obstacle_margin_m:.2f} m": control.obstacle_margin_m,
         f"gimbal {control.pitch_margin_rad2:.3f} rad²": control.pitch_margin_rad2,
     }
     yield "margins: " + ", ".join(text for text, value in margins.items() if margin(value) is not None)

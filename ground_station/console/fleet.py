@@ -8,6 +8,7 @@ from typing import Final, Literal
 
 from ground_station.console.constraints import all_in_words, margin
 from protocol.messages import Control, DroneState, Mode
+from protocol.separation import SIGMAS
 from protocol.vehicle_settings import Vehicles
 
 Severity = Literal["good", "notice", "warning", "bad"]
@@ -72,7 +73,7 @@ def fleet_row(
         found: list[tuple[Severity, str]] = [("notice", "its process has ended with the mission")]
     else:
         found = [*_of_link(state, link_age_s, alive), *_of_state(state, vehicles)]
-        found += [] if control is None else _of_control(control, vehicles)
+        found += [] if control is None else _of_control(control, state.position_sd_m, vehicles)
     found.sort(key=lambda worry: SEVERITIES.index(worry[0]), reverse=True)
     return FleetRow(
         drone=drone,
@@ -112,13 +113,17 @@ def _of_state(state: DroneState, vehicles: Vehicles) -> Iterator[tuple[Severity,
         yield "notice", "its importance is not complete"
 
 
-def _of_control(control: Control, vehicles: Vehicles) -> Iterator[tuple[Severity, str]]:
+def _of_control(control: Control, position_sd_m: float, vehicles: Vehicles) -> Iterator[tuple[Severity, str]]:
     if control.outcome not in ("solved", "none"):
         yield "warning", f"solver: {control.outcome.replace('_', ' ')}"
     if control.separation_margin_m2 < 0:
         yield "bad", "closer to another than allowed"
-    if control.region_margin_m < 0:
+    if control.region_margin_m < -SIGMAS * position_sd_m:
         yield "warning", "outside the flight region"
+    elif control.region_margin_m < 0:
+        yield "notice", "too unsure of its place for where it is in the flight region"
+    if control.obstacle_margin_m < 0:
+        yield "notice", "leaves what its map has learned of"
     if control.pitch_margin_rad2 < 0:
         yield "warning", "camera outside its range"
     if control.telemetry_age_s > vehicles.telemetry_stale_s:

@@ -11,9 +11,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ground_station.report.run_data import Flight, Run
 from ground_station.report.spells import Spell, spells
+from protocol.geometry import Floats
+from protocol.mission import Flight as FlightSettings
+from protocol.separation import SIGMAS
 
 Severity = Literal["note", "warning", "error"]
 SEVERITIES: tuple[Severity, ...] = ("note", "warning", "error")
@@ -32,9 +36,11 @@ BARRIERS: tuple[tuple[str, str, str, Severity], ...] = (
     ("inside the separation as lag and late commands widen it", "m²", "separation_margin_m2", "warning"),
     ("barrier of the flight region broken", "m", "region_margin_m", "error"),
     ("barrier of the camera pitch broken", "rad²", "pitch_margin_rad2", "error"),
+    ("nearer than its margin to what was not seen free", "m", "obstacle_margin_m", "note"),
 )
 """What it means that one is below zero. The separation's is wider than the distance that must be kept, by what a
-vehicle may fly on until a command works."""
+vehicle may fly on until a command works. The obstacles' falls when the map learns of something beside a drone."""
+GROWN = "inside the flight region's margin, which grew with what its place may be off"
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,11 +63,11 @@ def faults(run: Run) -> list[Fault]:
             found.append(Fault(time_s, time_s, event.source, event.text, event.level))
     if run.flight is not None and len(run.flight.time_s):
         for index, drone in enumerate(run.flight.drones.tolist()):
-            found += _of_drone(run.flight, index, f"drone/{drone}", run.mission.flight.separation_m)
+            found += _of_drone(run.flight, index, f"drone/{drone}", run.mission.flight)
     return sorted(found, key=lambda fault: (fault.start_s, fault.source, fault.text))
 
 
-def _of_drone(flight: Flight, index: int, source: str, separation_m: float) -> Iterator[Fault]:
+def _of_drone(flight: Flight, index: int, source: str, settings: FlightSettings) -> Iterator[Fault]:
     time_s, mode, fallback = flight.time_s, flight.mode[:, index], flight.fallback[:, index]
 
     for spell in spells(time_s, fallback != "", BRIDGED_S):
@@ -84,18 +90,32 @@ def _of_drone(flight: Flight, index: int, source: str, separation_m: float) -> I
         if spell.end_s - spell.start_s >= SILENT_S:
             yield _fault(spell, source, "not heard", "error")
 
+    told = SIGMAS * np.nan_to_num(flight.position_sd_m[:, index]) - settings.position_error_m
+    grown = np.where(told > 0, told, 0.0)  # by so much the region's margin is more than the mission says
+    region = flight.region_margin_m[:, index]
     for meaning, unit, column, severity in BARRIERS:
-        margin = getattr(flight, column)[:, index]
-        for spell in spells(time_s, margin < BROKEN, BRIDGED_S):
-            worst = np.nanmin(margin[spell.first : spell.behind])
-            yield _fault(spell, source, f"{meaning}, {worst:.3g} {unit} at worst", severity)
+        margin = region + grown if column == "region_margin_m" else getattr(flight, column)[:, index]
+        yield from _broken(time_s, margin, margin < BROKEN, source, (meaning, unit, severity))
+    only_grown = (region < BROKEN) & (region + grown >= BROKEN)
+    yield from _broken(time_s, region, only_grown, source, (GROWN, "m", "warning"))
 
     others = np.delete(flight.poses[:, :, :3], index, axis=1)
     distances = np.linalg.norm(others - flight.poses[:, index, None, :3], axis=2)
     nearest = np.fmin.reduce(distances, axis=1, initial=np.inf)
-    for spell in spells(time_s, nearest < separation_m, BRIDGED_S):
+    limit_m = settings.separation_m
+    for spell in spells(time_s, nearest < limit_m, BRIDGED_S):
         closest = np.nanmin(nearest[spell.first : spell.behind])
-        yield _fault(spell, source, f"{closest:.3f} m from another drone, less than {separation_m:g} m", "error")
+        yield _fault(spell, source, f"{closest:.3f} m from another drone, less than {limit_m:g} m", "error")
+
+
+def _broken(
+    time_s: Floats, margin: Floats, below: NDArray[np.bool_], source: str, told: tuple[str, str, Severity]
+) -> Iterator[Fault]:
+    """``told``: what it means, the margin's unit, and how bad it is."""
+    meaning, unit, severity = told
+    for spell in spells(time_s, below, BRIDGED_S):
+        worst = np.nanmin(margin[spell.first : spell.behind])
+        yield _fault(spell, source, f"{meaning}, {worst:.3g} {unit} at worst", severity)
 
 
 def _fault(spell: Spell, source: str, text: str, severity: Severity) -> Fault:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 PLAN_INCHES = (6.0, 6.1)
 MARGINS_INCHES = (6.0, 6.2)
+"""Of all kinds of rows together; they share the height."""
 MODES_INCHES = (12.5, 0.8)
 """Without drones."""
 BAR_INCHES = 0.19
@@ -48,11 +49,13 @@ MODE_COLOURS = {
 
 def margins(flight: Flight, mission: Mission) -> str:
     """The barriers b of each drone's strict rows over time, the smallest of each stretch; below 0 one was broken."""
-    rows = (
+    rows = [
         ("separation (m²)", flight.separation_margin_m2),
         ("region (m)", flight.region_margin_m),
         ("pitch (rad²)", flight.pitch_margin_rad2),
-    )
+    ]
+    if (flight.obstacle_margin_m < NO_ROW).any():
+        rows.insert(2, ("obstacles (m)", flight.obstacle_margin_m))
 
     def of(place: int, label: str, margin: Floats) -> Any:
         def draw(axes: Axes) -> None:

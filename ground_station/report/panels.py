@@ -61,7 +61,8 @@ def _of_the_flight(run: Run, flight: Flight) -> Iterator[Panel]:
         flight_figures.margins(flight, mission) if kept else None,
         "No margins were recorded.",
         shape="tall" if kept else "",
-        note="The smallest barrier b ≥ 0 of each kind that a drone’s controller keeps to, on its predicted pose.",
+        note="The smallest barrier b ≥ 0 of each kind that a drone’s controller keeps to, on its predicted pose."
+        " That of obstacles falls below 0 where the map has just learned of something beside a drone.",
     )
     solved = bool((flight.solve_time_s > 0).any())
     nothing = "No solve times were recorded."

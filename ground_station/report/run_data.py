@@ -32,6 +32,9 @@ class Flight:
     separation_margin_m2: Floats
     region_margin_m: Floats
     pitch_margin_rad2: Floats
+    obstacle_margin_m: Floats
+    position_sd_m: Floats
+    """Standard deviation that the drone told of its position; NaN throughout in files of earlier versions."""
     fallback: NDArray[np.str_]
     """Why the drone braked, or ""."""
     mode: NDArray[np.str_]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from protocol.messages import Control, DroneState, Mode, Outcome
+from protocol.messages import UNLIMITED, Control, DroneState, Mode, Outcome
 
 
 def told(
@@ -14,8 +14,10 @@ def told(
     mode: Mode = "flying",
     battery: float = 1.0,
     decided: bool = True,
+    obstacle_m: float = UNLIMITED,
+    position_sd_m: float = 0.0,
 ) -> DroneState:
-    """A state without its pose. ``margins``: separation in m², region in m, pitch in rad²."""
+    """A state without its pose. ``margins``: separation in m², region in m, pitch in rad²; ``obstacle_m``: likewise."""
     separation, region, pitch = margins
     control = Control.model_construct(
         solve_s=solve_s,
@@ -25,5 +27,8 @@ def told(
         separation_margin_m2=separation,
         region_margin_m=region,
         pitch_margin_rad2=pitch,
+        obstacle_margin_m=obstacle_m,
     )
-    return DroneState.model_construct(mode=mode, battery=battery, control=control if decided else None)
+    return DroneState.model_construct(
+        mode=mode, battery=battery, control=control if decided else None, position_sd_m=position_sd_m
+    )

@@ -144,6 +144,9 @@ def test_a_lone_drones_words_have_no_distance_to_others() -> None:
     lines = told(field(), {1: state(1, team(1, 1)[0], control=lone)}).lines
     assert "limits: none in the way" in lines
     assert "margins: region 1.20 m, gimbal 0.050 rad²" in lines
+    among = lone.model_copy(update={"obstacle_margin_m": 0.25})
+    lines = told(field(), {1: state(1, team(1, 1)[0], control=among)}).lines
+    assert "margins: region 1.20 m, obstacles 0.25 m, gimbal 0.050 rad²" in lines
 
 
 def test_a_drone_without_importance_in_reach_says_so() -> None:

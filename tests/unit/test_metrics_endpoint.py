@@ -144,6 +144,12 @@ def test_an_agents_figures_are_those_of_its_newest_state(registry: CollectorRegi
     assert found[series("covrecon_agent_slack")] == 0.25
     assert found[series("covrecon_agent_mode", {"mode": "flying"})] == 1
     assert found[series("covrecon_agent_mode", {"mode": "braking"})] == 0
+    assert series("covrecon_agent_obstacle_margin_meters") not in found, "of a row that is not there"
+
+    near = CONTROL.model_copy(update={"obstacle_margin_m": -0.02})
+    other = CollectorRegistry()
+    AgentMetrics(other).hear(STATE.model_copy(update={"control": near}))
+    assert read(other)[series("covrecon_agent_obstacle_margin_meters")] == -0.02
 
 
 def test_a_decision_counts_once_by_what_the_solver_said(registry: CollectorRegistry) -> None:

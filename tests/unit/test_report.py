@@ -16,13 +16,14 @@ from PIL import Image
 from faults.told import told
 from faults.zones import l_shaped
 from ground_station.evaluation import Score, Scores
-from ground_station.report import page, write_report
+from ground_station.report import flight_figures, page, write_report
 from ground_station.report.picture import oblique_view, view_from_above
 from ground_station.report.run_data import Mesh
 from ground_station.report.run_folder import load_run
 from ground_station.results import Metrics, RunFolder
 from protocol.errors import CovreconError, MissionError
 from protocol.map_settings import Feedback, Reconstruction
+from protocol.messages import UNLIMITED
 from protocol.mission import Drone, Mission
 
 SCORES = Scores(visible=Score.of(0.96, 0.8), exposed=Score.of(0.96, 0.7), objects=Score.of(0.9, 0.6))
@@ -70,6 +71,7 @@ def flown(
                 slack=-0.25,
                 outcome="infeasible" if drone == ids[-1] and tick in (50, 51) else "solved",
                 battery=1 - tick / 1000,
+                obstacle_m=0.3 + 0.4 * math.sin(tick / 40) if mission.flight.obstacles.enabled else UNLIMITED,
             )
             for drone in ids
         }
@@ -218,6 +220,16 @@ def test_one_drone_without_feedback_map_and_truth_still_gets_a_page(tmp_path: Pa
     assert "One drone: nobody to keep apart from." in shown.words
     assert shown.tags.count("svg") == 7
     assert not (tmp_path / "mesh.png").exists()
+
+
+@pytest.mark.parametrize("enabled", [False, True])
+def test_margins_of_obstacles_are_drawn_where_there_are_any(tmp_path: Path, *, enabled: bool) -> None:
+    folder = flown(tmp_path, team(2, flight={"obstacles": {"enabled": enabled}}), mapped=False)
+    flight = load_run(folder).flight
+    assert flight is not None
+    svg = flight_figures.margins(flight, team(2))
+    assert svg.count("separation (m²)</text>") == 1
+    assert svg.count("obstacles (m)</text>") == enabled
 
 
 def test_a_run_that_never_took_off_gets_a_page(tmp_path: Path) -> None:

@@ -82,6 +82,26 @@ def test_a_broken_barrier_is_told_with_its_worst_and_rounding_is_not() -> None:
     ]
 
 
+def test_a_region_s_margin_that_only_grew_is_no_broken_barrier_and_one_that_is_broken_beyond_that_is() -> None:
+    grown = told(margins=(1.0, -0.1, 0.1), position_sd_m=0.05)
+    broken = told(margins=(1.0, -0.2, 0.1), position_sd_m=0.05)
+    sure = told(margins=(1.0, -0.1, 0.1))
+    told_of = [(fault.text, fault.severity) for fault in faults(run([{}, {1: grown}, {}]))]
+    assert told_of == [
+        ("inside the flight region's margin, which grew with what its place may be off, -0.1 m at worst", "warning")
+    ]
+    for state, worst in ((broken, "-0.05"), (sure, "-0.1")):
+        told_of = [(fault.text, fault.severity) for fault in faults(run([{}, {1: state}, {}]))]
+        assert told_of == [(f"barrier of the flight region broken, {worst} m at worst", "error")]
+
+
+def test_what_a_map_learns_beside_a_drone_is_a_note() -> None:
+    ticks = [{1: told(obstacle_m=0.2)}, {1: told(obstacle_m=-0.04)}, {1: told(obstacle_m=-0.01)}, {}]
+    assert faults(run(ticks)) == [
+        Fault(0.05, 0.15, "drone/1", "nearer than its margin to what was not seen free, -0.04 m at worst", "note")
+    ]
+
+
 def test_drones_that_come_too_near_are_an_error() -> None:
     assert [(fault.source, fault.text, fault.severity) for fault in faults(run([{}, {}], apart_m=0.75))] == [
         ("drone/1", "0.750 m from another drone, less than 1 m", "error"),

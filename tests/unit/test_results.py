@@ -24,7 +24,8 @@ from ground_station.mesh_files import mesh_sha256
 from ground_station.pose_errors import PoseErrorFigures
 from ground_station.results import Metrics, RunFolder, versions
 from protocol.errors import MissionError, StorageError
-from protocol.mission import Drone, Mission
+from protocol.mission import Drone, Flight, Mission
+from protocol.obstacle_settings import Obstacles
 
 MISSION = Mission(
     name="pair",
@@ -146,10 +147,25 @@ def test_the_summary_holds_every_figure_by_which_runs_are_compared(folder: RunFo
         "sim_time_s": 0.5, "wall_time_s": 2.5, "feedback_update_s": 0.0123,
         "pose_error_rms_m": 0.02, "pose_error_max_m": 0.05, "pose_error_final_m": 0.01, "pose_error_yaw_rms_rad": 0.003,
         "pose_error_beyond": 0.001, "keyframes_unlocated": 5, "contacts": {"1": 0, "4": 2},
+        "min_obstacle_margin_m": None, "fallbacks_among_obstacles": None,
         "phi_sha256": "f" * 64, "mesh_sha256": mesh_sha256(VERTICES, FACES),
     }  # fmt: skip
     assert isinstance(baseline, dict)
     assert baseline["f_score_visible"] == pytest.approx(2 / 3, abs=1e-6)
+
+
+def test_the_summary_says_how_near_drones_came_to_obstacles_and_how_often_they_braked_among_them(
+    tmp_path: Path,
+) -> None:
+    mission = MISSION.model_copy(update={"flight": Flight(obstacles=Obstacles(enabled=True))})
+    run = RunFolder(tmp_path, mission)
+    for tick, margin in enumerate((0.5, -0.0625)):
+        states = {1: told(obstacle_m=margin, outcome="infeasible"), 4: told(outcome="infeasible")}
+        run.record_tick(tick, tick / 20, {1: (0, 0, 1, 0, 1), 4: (3, 0, 1, 0, 1)}, states)
+    summary = finish(run)
+    run.close()
+    assert summary["min_obstacle_margin_m"] == -0.0625
+    assert summary["fallbacks_among_obstacles"] == {"1": 2, "4": 0}
 
 
 def test_trajectories_and_solver_outcomes_are_read_back(folder: RunFolder) -> None:

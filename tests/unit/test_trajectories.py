@@ -11,7 +11,10 @@ from faults.told import told
 from ground_station.trajectories import Trajectories, read_trajectories
 
 POSE = (1.0, 2.0, 3.0, 0.1, 1.2)
-LATER = ("mode", "battery", "separation_margin_m2", "region_margin_m", "pitch_margin_rad2")
+LATER = (
+    "mode", "battery", "separation_margin_m2", "region_margin_m", "pitch_margin_rad2", "obstacle_margin_m",
+    "position_sd_m",
+)  # fmt: skip
 
 
 def flown(ticks: int = 3) -> Trajectories:
@@ -48,6 +51,20 @@ def test_a_file_of_an_earlier_version_is_read_and_gone_on_with(tmp_path: Path) -
     mode, margin = trajectories.arrays()["mode"], trajectories.arrays()["region_margin_m"]
     assert mode.tolist() == [["", ""]] * 3 + [["landing", ""]]
     np.testing.assert_allclose(margin, [[np.nan, np.nan]] * 3 + [[1.0, np.nan]])
+    assert trajectories.min_obstacle_margin_m() is None, "neither a row of which nobody told nor one that is not there"
+
+
+def test_how_near_drones_came_to_obstacles_and_braked_among_them_is_counted() -> None:
+    trajectories = Trajectories([2, 5])
+    for tick, margin in enumerate((0.4, -0.03, 0.2)):
+        near = told(obstacle_m=margin, outcome="infeasible" if tick else "solved", position_sd_m=0.01)
+        far = told(outcome="infeasible")
+        trajectories.add(tick, tick / 20, {2: POSE}, {2: near, 5: far})
+
+    assert trajectories.min_obstacle_margin_m() == -0.03
+    assert trajectories.fallbacks_among_obstacles() == {2: 2, 5: 0}
+    assert trajectories.fallbacks() == {2: 2, 5: 3}
+    np.testing.assert_allclose(trajectories.arrays()["position_sd_m"], [[0.01, 0.0]] * 3)
 
 
 def test_after_reading_the_same_rows_follow_as_without(tmp_path: Path) -> None:

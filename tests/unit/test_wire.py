@@ -15,6 +15,7 @@ from pydantic import ValidationError
 from protocol import messages
 from protocol.errors import MessageError, VersionError
 from protocol.messages import (
+    UNLIMITED,
     CommandReply,
     Control,
     DroneOrder,
@@ -61,6 +62,7 @@ CONTROL = Control(
     active=("region:+x", "separation:3"),
     fallbacks=1,
     refused=2,
+    obstacle_margin_m=-0.125,
 )
 ROW = DroneStatus(
     drone=1,
@@ -304,6 +306,13 @@ def test_an_older_minor_versions_message_takes_the_defaults_of_what_it_lacks(mon
     found = decode(DroneState, msgpack.packb(fields))
 
     assert (found.obeyed, found.blind_s) == (0, 0.0)
+
+
+def test_a_decision_of_a_release_without_obstacle_margins_has_no_such_row() -> None:
+    fields = unpacked(CONTROL) | {"m": 3}
+    del fields["obstacle_margin_m"]
+
+    assert decode(Control, msgpack.packb(fields)) == CONTROL.model_copy(update={"obstacle_margin_m": UNLIMITED})
 
 
 def test_a_keyframe_of_a_release_without_depth_cameras_has_none() -> None:
