@@ -23,11 +23,11 @@ from prometheus_client import CollectorRegistry
 from agents.agent_metrics import AgentMetrics
 from agents.barriers import Neighbour, predicted_pose
 from agents.cameras.choice import make_feed
-from agents.climbing import Climbing
 from agents.energy import Reserve
 from agents.hearing import Hearing
 from agents.homing import Homecoming
 from agents.localization.choice import make_pose_source
+from agents.obstacle_watch import ObstacleWatch
 from agents.obstacles import Obstacles
 from agents.orders import Orders
 from agents.planners.choice import make_planner
@@ -51,7 +51,6 @@ from protocol.messages import (
     DroneOrder,
     DroneState,
     EventLevel,
-    FreeCells,
     JumpHead,
     MissionPhase,
     Mode,
@@ -114,12 +113,8 @@ class Agent:
         self._replication = Replication(mission, drone)
         self._synchroniser = Synchroniser(bus, self._replication, drone)
         self._planner = make_planner(mission, drone)
-        self._obstacles = Obstacles(mission) if mission.flight.obstacles.enabled else None
-        self._climbing = None
-        if self._obstacles is not None:
-            self._planner.heed(self._obstacles)
-            self._climbing = Climbing(mission, self._obstacles)
-        self._homecoming = Homecoming(mission, drone, self._planner, self._obstacles)
+        self._watch = ObstacleWatch(mission, self._planner, now_s, lockstep=lockstep)
+        self._homecoming = Homecoming(mission, drone, self._planner, self._watch.obstacles)
         self._clock = clock_of(mission, bus, lockstep=lockstep, now_s=now_s)
         self._news = News(bus, topics.EVENT, f"drone/{drone}", drone)
         self._hearing = Hearing(mission, drone, bus, self._replication, self._team, self._news.tell, lockstep=lockstep)
@@ -127,7 +122,7 @@ class Agent:
         self._poses = make_pose_source(mission, drone, bus, lockstep=lockstep)
         self._orders = Orders(mission, self._clock.now_s, self._news.tell)
         self._operator = DroneOrder(drone=drone, action="fly", number=0)
-        self._reserve = Reserve(mission, drone, self._obstacles)
+        self._reserve = Reserve(mission, drone, self._watch.obstacles)
         self._swap = Swap(mission, drone, self._news.tell)
         self._climb_m = 0.0
         self._feed = make_feed(mission, drone, bus, now_s=self._clock.now_s)
@@ -144,7 +139,7 @@ class Agent:
         self._cells_at = -np.inf
         self._control: Control | None = None
         self._fallbacks = 0
-        self._ground_heard_s = self._map_heard_s = now_s()
+        self._ground_heard_s = now_s()
         self._landed_told = 0
         self._blind = False
         self._finished_s = math.inf
@@ -157,8 +152,7 @@ class Agent:
         bus.on(topics.HEAD, self._hear_head)
         bus.on(topics.DIGEST, self._replication.hear_digest)
         bus.on(topics.PHASE, self._hear_phase)
-        if self._obstacles is not None:
-            bus.on(topics.FREE, self._hear_free)
+        self._watch.listen(bus)
         bus.serve(topics.DRONE_BLOCKS, blocks_of(self._replication), drone)
         bus.watch_lives()
 
@@ -216,11 +210,6 @@ class Agent:
     def _hear_head(self, head: JumpHead) -> None:
         self._ground_heard_s = self._now_s()
         self._replication.hear_head(head)
-
-    def _hear_free(self, cells: FreeCells) -> None:
-        self._map_heard_s = self._now_s()
-        if self._obstacles is not None:
-            self._obstacles.hear(cells)
 
     def _hear_phase(self, order: MissionPhase) -> None:
         self._ground_heard_s = self._now_s()
@@ -299,9 +288,6 @@ class Agent:
             self._reserve.land()
         elif condition.authority == "ours" and telemetry is not None and self._is_sound(telemetry):
             self._reserve.look(telemetry)
-        map_silence = None
-        if self._obstacles is not None and not self._lockstep:
-            map_silence = (self._map_heard_s, self._now_s())
         order = self._orders.give(
             telemetry,
             condition,
@@ -309,7 +295,7 @@ class Agent:
             self._finished,
             self._operator.action,
             reserve=self._reserve.share,
-            map_silent_s=map_silence,
+            map_silent_s=self._watch.silence,
         )
         self._swap.note(order, stays=bool(self._finished) or self._operator.action in ("return", "land"))
         return order
@@ -319,7 +305,7 @@ class Agent:
         if not self._vehicle.make_ready():
             return condition
         self._swap.renew(telemetry.stamp_s)
-        self._homecoming = Homecoming(self._mission, self._drone, self._planner, self._obstacles)
+        self._homecoming = Homecoming(self._mission, self._drone, self._planner, self._watch.obstacles)
         return self._vehicle.condition()
 
     def _way_up_is_free(self, telemetry: Telemetry | None, tick: int) -> bool:
@@ -331,8 +317,7 @@ class Agent:
     def _put_off(self) -> None:
         """Something else than the planner, or nobody here, flies now."""
         self._homecoming.put_off()
-        if self._climbing is not None:
-            self._climbing.put_off()
+        self._watch.put_off()
 
     def _publish(self, telemetry: Telemetry, tick: int, mode: Mode, blind_s: float = 0.0) -> None:
         state = self._state_of(telemetry, tick, mode, blind_s)
@@ -357,14 +342,13 @@ class Agent:
 
     def _is_ready(self, tick: int) -> bool:
         gone = self._bus.gone
-        mapped = self._obstacles is None or self._obstacles.is_ready(tick) or "ground" in gone
+        mapped = self._watch.is_ready(tick) or "ground" in gone
         return mapped and self._replication.is_ready(tick, gone)
 
     def _decide(self, telemetry: Telemetry, tick: Tick, mode: Mode, terms: SamplingTerms) -> Decision:
         neighbours = self._neighbours(telemetry, tick.tick)
         self._planner.note_deviation(telemetry.position_sd_m)
-        if self._obstacles is not None:
-            self._obstacles.advance(tick.tick, telemetry.position_sd_m)
+        self._watch.advance(tick.tick, telemetry.position_sd_m)
         if mode in ("returning", "landing"):
             return self._homecoming.steer(
                 telemetry.pose,
@@ -378,17 +362,15 @@ class Agent:
             self._put_off()
             return self._planner.steer(telemetry.pose, telemetry.velocity, neighbours)
         self._homecoming.put_off()
-        if self._climbing is not None:
-            wish = self._climbing.wish(telemetry.pose[:3], tick.time_s)
-            if wish is not None:
-                return self._planner.steer(telemetry.pose, telemetry.velocity, neighbours, wish)
+        wish = self._watch.wish(telemetry.pose[:3], tick.time_s)
+        if wish is not None:
+            return self._planner.steer(telemetry.pose, telemetry.velocity, neighbours, wish)
         if tick.time_s - self._cells_at >= SHARE_PERIOD_S:
             row, poses = self._replication.newest()
             self._cells = float(self._replication.replica.field.owned_cells(poses)[row])
             self._cells_at = tick.time_s
         decision = self._planner.decide(telemetry.pose, telemetry.velocity, neighbours, terms, self._cells)
-        if self._climbing is not None:
-            self._climbing.look(telemetry.pose[:3], decision, tick.time_s)
+        self._watch.look(telemetry.pose[:3], decision, tick.time_s)
         return decision
 
     def _neighbours(self, telemetry: Telemetry, tick: int) -> list[Neighbour]:
