@@ -112,6 +112,7 @@ def test_drones_never_enter_a_zone_whatever_it_is_like(mission: Mission) -> None
     assert len(mission.drones) == 1 or flight.min_separation >= mission.flight.separation_m
 
 
+@pytest.mark.timeout(240)
 def test_drones_whose_estimates_drift_keep_their_true_distance_from_zones(tmp_path: Path) -> None:
     """All processes in virtual time. Without margins that grow, the same flight is 195 ticks too near, by 11 cm."""
     region, base = l_shaped(), schedule(0).mission.model_dump()
