@@ -88,7 +88,7 @@ class GroundStation:
         self._feedback = MapFeedback(mission, mapper, self._jumps, recorder, self._news.tell, lockstep=lockstep)
         self._obstacles = None
         if mission.flight.obstacles.enabled:
-            self._obstacles = ObstaclePublisher(mission, bus, mapper, self._feedback, lockstep=lockstep)
+            self._obstacles = ObstaclePublisher(mission, bus, mapper, self._feedback, recorder, lockstep=lockstep)
         self._recovery = Recovery(mission, bus, run, self._replication, self._jumps, self._feedback, mapper)
         self._clock = clock_of(mission, bus, lockstep=lockstep, now_s=asyncio.get_running_loop().time)
         self._lag = LoopLag()

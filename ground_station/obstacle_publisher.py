@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 from ground_station.map_feedback import MapFeedback
 from ground_station.mapper import Mapper
+from ground_station.recording.recorder import Recorder
 from protocol import topics
 from protocol.bus import Bus
 from protocol.messages import FreeCells
@@ -29,8 +30,11 @@ class _Look:
 class ObstaclePublisher:
     """Of a mission with obstacles."""
 
-    def __init__(self, mission: Mission, bus: Bus, mapper: Mapper, feedback: MapFeedback, *, lockstep: bool) -> None:
-        self._bus, self._mapper, self._feedback, self._lockstep = bus, mapper, feedback, lockstep
+    def __init__(
+        self, mission: Mission, bus: Bus, mapper: Mapper, feedback: MapFeedback, recorder: Recorder, *, lockstep: bool
+    ) -> None:
+        self._bus, self._mapper, self._feedback, self._recorder = bus, mapper, feedback, recorder
+        self._lockstep = lockstep
         self._grid, self._period = ObstacleGrid.of(mission), period_ticks(mission)
         self._looks: deque[_Look] = deque()
         self._looked = -1
@@ -61,6 +65,7 @@ class ObstaclePublisher:
             self._looks.popleft()
             effective = look.effective if self._lockstep else tick
             self._bus.put(topics.FREE, FreeCells(tick=effective, packed=self._grid.pack(free)))
+            self._recorder.free(effective, self._grid, free)
 
     def close(self) -> None:
         """Nobody flies by them any more."""

@@ -115,7 +115,7 @@ GROUND_EVENT = Topic("ground/event", messages.Event, ("ground",), ("operator",),
                      "DATA_HIGH", 256, _NO_AGE, True, 16 * _KIB)
 MAP = Topic("map/blocks", messages.MeshPage, ("ground",), ("operator",),
             "BACKGROUND", 4, _NO_AGE, False, MAX_MESSAGE_BYTES, queryable=True)
-FREE = Topic("map/free", messages.FreeCells, ("ground",), ("agent",),
+FREE = Topic("map/free", messages.FreeCells, ("ground",), ("agent", "operator"),
              "DATA_HIGH", 16, _NO_AGE, False, 2 * _MIB)
 MAP_KEYFRAMES = Topic("map/keyframes", messages.KeyframePage, ("ground",), ("mapper",),
                       "DATA_LOW", 4, _NO_AGE, False, MAX_MESSAGE_BYTES, queryable=True)

@@ -53,6 +53,8 @@ class Console:
         bus.on(topics.GROUND_EVENT, situation.hear_event)
         bus.on(topics.PHASE, situation.hear_phase)
         bus.on(topics.STATUS, situation.hear_status)
+        if mission.flight.obstacles.enabled:
+            bus.on(topics.FREE, situation.hear_free, wakes=False)
         bus.watch_lives()
 
     def _hear_state(self, state: DroneState) -> None:

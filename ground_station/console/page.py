@@ -46,7 +46,7 @@ class Page:
         with why.add_tab("Why there?", viser.Icon.ROUTE):
             self._why_panel = WhyPanel(gui)
         with why.add_tab("View", viser.Icon.EYE):
-            options = ViewOptions(gui)
+            options = ViewOptions(gui, mission)
         gui.main_panel.dock_left()
         gui.main_panel.set_width(LEFT_PX)
         drone.dock_below(gui.main_panel)
@@ -86,6 +86,7 @@ class Page:
         explanation: Explanation | None = None
         with self._server.atomic():
             self._scene.draw_trails(self._situation)
+            self._scene.draw_free(chosen, self._situation)
             if importance is not None:
                 poses = np.array([state.pose for state in states.values()]).reshape(-1, 5)
                 self._scene.draw_field(importance.phi, list(states), poses)

@@ -15,6 +15,7 @@ from ground_station import mesh_files
 from ground_station.console.drone_view import orientation
 from ground_station.console.explanation import Explanation
 from ground_station.console.field_view import Colours, FieldView, PointCloud, drone_colours
+from ground_station.console.free_view import Cut, FreeView
 from ground_station.console.mesh_cache import Key, MeshCache, Redraw
 from ground_station.console.orders_panel import Post
 from ground_station.console.situation import Situation
@@ -22,7 +23,7 @@ from protocol.airspace import outlines
 from protocol.field import VirtualField
 from protocol.geometry import Floats
 from protocol.messages import MeshBlock
-from protocol.mission import Box, Mission
+from protocol.mission import Mission
 
 Y_UP = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)
 """Quaternion w, x, y, z from glTF's axes, y up, to the world's."""
@@ -36,6 +37,10 @@ BODY_M, FRUSTUM_M = 0.08, 0.3
 LINE_PX, BOX_PX, ZONE_PX = 2.0, 1.0, 1.5
 AMBIENT = 1.5
 """Light from everywhere: the map's colours have their light and shade from the pictures."""
+FREE_COLOUR, NOT_FREE_COLOUR = (64, 192, 140, 56), (240, 101, 92, 120)
+"""With alpha: of the cut through the free space."""
+PIXELS = 4
+"""Of a cell along each axis: a browser blurs one into the next."""
 POINT_SHARE = 0.12
 """Size of a point of the importance, of the distance of two."""
 PULL_PX = 12.0
@@ -46,17 +51,28 @@ VIEW_DISTANCE = 0.95
 
 MapStyle = Literal["colours", "grey", "hidden"]
 FieldStyle = Literal["importance", "owners", "hidden"]
+FreeStyle = Literal["hidden", "at the drone's height", "at a height"]
 
 
 class ViewOptions:
     """What the operator wants to see; shared by all pages."""
 
-    def __init__(self, gui: viser.GuiApi) -> None:
+    def __init__(self, gui: viser.GuiApi, mission: Mission) -> None:
         self._map = gui.add_dropdown("Map", ("colours", "grey", "hidden"))
         self._field = gui.add_dropdown("Importance", ("importance", "owners", "hidden"))
         self._hide_below = gui.add_slider("Hide below", min=0.0, max=1.0, step=0.05, initial_value=HIDE_BELOW)
         self._trails = gui.add_checkbox("Trails", initial_value=True)
         self._pulls = gui.add_checkbox("Pulls on the chosen drone", initial_value=True)
+        self._free: viser.GuiDropdownHandle[FreeStyle] | None = None
+        if mission.flight.obstacles.enabled:
+            self._free = gui.add_dropdown("Free space", ("hidden", "at the drone's height", "at a height"))
+            low, high = mission.flight.lower_m[2], mission.flight.upper_m[2]
+            step = mission.flight.obstacles.cell_m
+            self._height = gui.add_slider("Height, m", low, high, step, (low + high) / 2, visible=False)
+            self._free.on_update(self._show_height)
+
+    def _show_height(self, _: object) -> None:
+        self._height.visible = self.free == "at a height"
 
     def when_map_changes(self, call: Callable[[], None], post: Post) -> None:
         self._map.on_update(lambda _: post(call))
@@ -78,6 +94,15 @@ class ViewOptions:
         return self._trails.value
 
     @property
+    def free(self) -> FreeStyle:
+        return "hidden" if self._free is None else self._free.value
+
+    @property
+    def height_m(self) -> float:
+        """Of the cut through the free space, if it is "at a height"."""
+        return float(self._height.value)
+
+    @property
     def pulls(self) -> bool:
         return self._pulls.value
 
@@ -88,6 +113,11 @@ class Scene:
         self._ids = [drone.id for drone in mission.drones]
         self._colours = drone_colours(range(len(mission.drones)))
         self._field = FieldView(VirtualField.of(mission.target), mission.sensing)
+        self._free = FreeView(mission) if mission.flight.obstacles.enabled else None
+        self._cut: int | None = None
+        """Level that is drawn."""
+        self._near: tuple[float, ...] | None = None
+        """Place of the drone whose nearest cell is drawn."""
         self._map = MeshCache()
         self._drawn: dict[Key, viser.SceneNodeHandle] = {}
         _set_stage(server, mission)
@@ -148,6 +178,64 @@ class Scene:
             return
         size = POINT_SHARE * self._field.pitch_m
         self._scene.add_point_cloud(name, cloud.points, cloud.colours, point_size=size, point_shape="circle")
+
+    # --- free space ----------------------------------------------------------------------------------------------
+
+    def draw_free(self, chosen: int, situation: Situation) -> None:
+        """The cut at its height, and what of what is not free is nearest to the drone ``chosen``."""
+        if self._free is None:
+            return
+        style, state = self._options.free, situation.states().get(chosen)
+        if style == "hidden" or (style == "at the drone's height" and state is None):
+            self._scene.remove_by_name("/free")
+            self._cut = self._near = None
+            return
+        changed = self._free.take(situation.free)
+        at_drone = state is not None and style == "at the drone's height"
+        level = self._free.level(state.pose[2] if at_drone else self._options.height_m)
+        if changed or level != self._cut:
+            if self._cut is None:
+                self._scene.add_frame("/free", show_axes=False)
+            self._draw_cut(self._free.cut(level), self._free)
+            self._cut = level
+        place = None if state is None else state.pose[:3]
+        if changed or place != self._near:
+            self._near = place
+            self._draw_nearest(self._free, place)
+
+    def _draw_cut(self, cut: Cut, view: FreeView) -> None:
+        grid = view.grid
+        width, height = (grid.cell_m * count for count in grid.shape[:2])
+        cells = np.where(cut.free[..., None], *(np.array(rgba, np.uint8) for rgba in (FREE_COLOUR, NOT_FREE_COLOUR)))
+        rows = cells.transpose(1, 0, 2)[::-1]  # a picture's first row is the one farthest along y
+        self._scene.add_image(
+            "/free/cut",
+            rows.repeat(PIXELS, axis=0).repeat(PIXELS, axis=1),
+            width,
+            height,
+            cast_shadow=False,
+            receive_shadow=False,
+            position=(grid.origin[0] + width / 2, grid.origin[1] + height / 2, cut.height_m),
+        )
+        self._draw_lines("/free/borders", cut.borders)
+
+    def _draw_nearest(self, view: FreeView, place: tuple[float, ...] | None) -> None:
+        nearest = None if place is None else view.nearest(np.array(place))
+        if place is None or nearest is None:
+            self._draw_lines("/free/nearest", np.empty((0, 2, 3), np.float32))
+            self._scene.remove_by_name("/free/distance")
+            return
+        cell = _edges(nearest.low, nearest.low + view.grid.cell_m)
+        line = np.array([[place, nearest.point]], np.float32)
+        self._draw_lines("/free/nearest", np.concatenate([cell, line]))
+        middle = line[0].mean(axis=0)
+        self._scene.add_label("/free/distance", f"{nearest.distance_m:.2f} m", position=middle)
+
+    def _draw_lines(self, name: str, segments: NDArray[np.float32]) -> None:
+        if len(segments):
+            self._scene.add_line_segments(name, segments, ZONE_COLOUR, thickness=ZONE_PX, thickness_units="screen")
+        else:
+            self._scene.remove_by_name(name)
 
     # --- map -----------------------------------------------------------------------------------------------------
 
@@ -246,7 +334,13 @@ def _set_stage(server: viser.ViserServer, mission: Mission) -> None:
         section_color=GRID_COLOUR,
     )
     for name, box, colour in (("/target", target, TARGET_COLOUR), ("/flight", flight, FLIGHT_COLOUR)):
-        scene.add_line_segments(name, _edges(box), colour, thickness=BOX_PX, thickness_units="screen")
+        scene.add_line_segments(
+            name,
+            _edges(np.array(box.lower_m), np.array(box.upper_m)),
+            colour,
+            thickness=BOX_PX,
+            thickness_units="screen",
+        )
     zones = outlines(flight).astype(np.float32)
     if len(zones):
         scene.add_line_segments("/zones", zones, ZONE_COLOUR, thickness=ZONE_PX, thickness_units="screen")
@@ -255,9 +349,9 @@ def _set_stage(server: viser.ViserServer, mission: Mission) -> None:
     server.initial_camera.position = centre + VIEW_DISTANCE * diagonal * np.array([-0.55, -0.55, 0.6])
 
 
-def _edges(box: Box) -> NDArray[np.float32]:
-    """(12, 2, 3)"""
-    corners = np.array(list(product(*zip(box.lower_m, box.upper_m, strict=True))), np.float32)
+def _edges(low: Floats, high: Floats) -> NDArray[np.float32]:
+    """(12, 2, 3), of the box between two corners."""
+    corners = np.array(list(product(*zip(low, high, strict=True))), np.float32)
     pairs = [(one, other) for one in range(8) for other in range(one) if (one ^ other).bit_count() == 1]
     edges: NDArray[np.float32] = corners[np.array(pairs)]
     return edges

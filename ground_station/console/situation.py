@@ -9,7 +9,7 @@ from ground_station.console.drone_view import Trail
 from ground_station.console.events import EventList
 from ground_station.console.fleet import FleetRow, fleet_row
 from ground_station.console.history import History
-from protocol.messages import DroneState, Event, Keyframe, MissionPhase, Status
+from protocol.messages import DroneState, Event, FreeCells, Keyframe, MissionPhase, Status
 from protocol.mission import Mission
 
 CURVES = ("importance", "f_score_visible", "f_score_objects")
@@ -34,6 +34,7 @@ class Situation:
         self.drones = {drone.id: Drone() for drone in mission.drones}
         self.status: Status | None = None
         self.phase: MissionPhase | None = None
+        self.free: FreeCells | None = None
         self.events = EventList()
         self.history = History(len(CURVES))
         self._ground_heard_s: float | None = None
@@ -59,6 +60,9 @@ class Situation:
     def hear_phase(self, phase: MissionPhase) -> None:
         self.phase = phase
         self._ground_heard_s = self._now_s()
+
+    def hear_free(self, cells: FreeCells) -> None:
+        self.free = cells
 
     def hear_event(self, event: Event) -> None:
         self.events.add(event)

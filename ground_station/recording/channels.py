@@ -35,7 +35,7 @@ from protocol.mission import Mission
 
 Kind: TypeAlias = Literal[
     "mission", "state", "depth", "keyframe", "event", "phase", "status", "hand_over", "look", "integrated", "jump",
-    "phi", "mesh", "metrics", "summary",
+    "phi", "mesh", "free", "metrics", "summary",
 ]  # fmt: skip
 
 MISSION: Final = "/mission"
@@ -49,6 +49,7 @@ LOOK: Final = "/ground/look"
 INTEGRATED: Final = "/ground/integrated"
 JUMP: Final = "/phi/jump"
 MESH: Final = "/map"
+FREE: Final = "/map/free"
 METRICS: Final = "/ground/metrics"
 SUMMARY: Final = "/ground/summary"
 _TRANSFORMS: Final = "/tf"
@@ -73,6 +74,7 @@ CHANNELS: Final[Mapping[Kind, tuple[str, ...]]] = {
     "jump": (JUMP,),
     "phi": (PHI,),
     "mesh": (MESH,),
+    "free": (FREE,),
     "metrics": (METRICS,),
     "summary": (SUMMARY,),
 }
@@ -87,6 +89,7 @@ _FOR_PLAYERS: Final[Mapping[str, Any]] = {
     _LOG: players.Log,
     PHI: players.PointCloud,
     MESH: players.SceneUpdate,
+    FREE: players.PointCloud,
 }
 _SCHEMAS: Final[Mapping[str, tuple[str, type]]] = {
     MISSION: ("Mission", StoredMission),
@@ -192,6 +195,8 @@ class Channels:
                 self._show(PHI, shapes.cloud(self._positions, content, time_ns), time_ns)
             case "mesh":
                 self._show(MESH, shapes.scene(content, time_ns), time_ns)
+            case "free":
+                self._show(FREE, shapes.free_surface(*content, time_ns), time_ns)
             case "metrics":
                 self._log(METRICS, to_json(asdict(content), inf_nan_mode="null"), time_ns)
             case "summary":

@@ -28,6 +28,7 @@ from ground_station.recording.writer import RecordingWriter
 from ground_station.results import Metrics, Summary
 from protocol import messages, topics
 from protocol.mission import Mission
+from protocol.obstacle_grid import Cells, ObstacleGrid
 from protocol.replication import Integrated
 from protocol.topics import Topic
 from protocol.wire import Message
@@ -173,6 +174,11 @@ class Recorder:
         """phi (positions, directions), of which each position's mean is recorded, as often as the map."""
         if self._is_due("phi", tick):
             self._offer("phi", phi.mean(axis=1, dtype=np.float32), tick)
+
+    def free(self, tick: int, grid: ObstacleGrid, seen: Cells) -> None:
+        """What the map has seen free of ``grid``; recorded as often as the map. It must not change later."""
+        if self._is_due("free", tick):
+            self._offer("free", (grid, seen), tick)
 
     def metrics(self, metrics: Metrics) -> None:
         self._offer("metrics", metrics, metrics.tick)

@@ -30,11 +30,13 @@ from foxglove.messages import (
     Vector3,
 )
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 
 from ground_station.mesh_files import glb
 from ground_station.reconstruction.reconstructor import Mesh
 from protocol import messages
 from protocol.geometry import Floats
+from protocol.obstacle_grid import Cells, ObstacleGrid
 
 WORLD: Final = "world"
 GLB_TYPE: Final = "model/gltf-binary"
@@ -51,6 +53,7 @@ _POINT_FIELDS = [
       for i, name in enumerate(("red", "green", "blue", "alpha"))),
     PackedElementField(name="importance", offset=16, type=PackedElementFieldNumericType.Float32),
 ]  # fmt: skip
+_PLACE = np.dtype(("<f4", 3))
 _QUARTER_TURN_BACK = Quaternion(x=0.0, y=0.0, z=-math.sqrt(0.5), w=math.sqrt(0.5))
 """Players turn a glTF model, whose y is up, so that its z comes to lie along the world's x; `glb` means -y."""
 
@@ -148,6 +151,23 @@ def cloud(positions: Floats, importance: NDArray[np.float32], time_ns: int) -> P
         point_stride=POINT.itemsize,
         fields=_POINT_FIELDS,
         data=points.tobytes(),
+    )
+
+
+def free_surface(grid: ObstacleGrid, seen: Cells, time_ns: int) -> PointCloud:
+    """Where free space ends: the middles of cells that are not free beside one that is, ``seen`` so or vouched for.
+    Above the lattice all is free; what lies beside and below it is not judged."""
+    free = seen | grid.vouched
+    padded = np.pad(free, 1)
+    padded[:, :, -1] = True
+    beside = binary_dilation(padded)[1:-1, 1:-1, 1:-1]
+    places = grid.origin + grid.cell_m * (np.argwhere(beside & ~free) + 0.5)
+    return PointCloud(
+        timestamp=stamp(time_ns),
+        frame_id=WORLD,
+        point_stride=_PLACE.itemsize,
+        fields=_POINT_FIELDS[:3],
+        data=places.astype(_PLACE.base).tobytes(),
     )
 
 

@@ -16,6 +16,7 @@ from ground_station.results import Metrics, Summary
 from protocol import messages, topics
 from protocol.field import VirtualField
 from protocol.mission import Drone, Mission
+from protocol.obstacle_grid import ObstacleGrid
 from protocol.replication import Integrated
 
 KEYFRAME_TICKS = 10
@@ -120,7 +121,10 @@ class Flight:
             mesh_sha256="b", versions={},
         )  # fmt: skip
         recorder.finished(summary, self.meshes[-1])
-        self.offered.update(["/map", "/ground/summary"])
+        grid = ObstacleGrid.of(self.mission)
+        self.free = grid, self.random.random(grid.shape) < 0.5
+        recorder.free(tick, *self.free)
+        self.offered.update(["/map", "/map/free", "/ground/summary"])
 
     def _metrics(self, tick: int) -> Metrics:
         time_s = tick * self.mission.tick_s

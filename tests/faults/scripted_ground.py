@@ -26,6 +26,7 @@ from protocol.messages import (
     DroneStatus,
     Event,
     EventLevel,
+    FreeCells,
     JumpHead,
     Keyframe,
     MeshPage,
@@ -37,6 +38,7 @@ from protocol.messages import (
     Vector5,
 )
 from protocol.mission import Mission
+from protocol.obstacle_grid import ObstacleGrid
 from protocol.replication import Replication
 from protocol.synchroniser import blocks_of
 from protocol.topics import M
@@ -161,7 +163,16 @@ class ScriptedGround:
         self._put(topics.HEAD, head)
         if self.tick % STATUS_TICKS == 0:
             self._put(topics.STATUS, self._status())
+            self._tell_free()
             self._put(topics.PHASE, MissionPhase(phase=self.phase, reason="", orders=self._desk.orders))
+
+    def _tell_free(self) -> None:
+        """More of the room each time, from one wall on; and less again when all of it was free."""
+        if self._mission.flight.obstacles.enabled:
+            grid = ObstacleGrid.of(self._mission)
+            columns = np.arange(grid.shape[0]) < self.tick // STATUS_TICKS % (grid.shape[0] + 1)
+            seen = np.broadcast_to(columns[:, None, None], grid.shape)
+            self._put(topics.FREE, FreeCells(tick=self.tick, packed=grid.pack(seen)))
 
     def _put(self, topic: topics.Topic[M], message: M, drone: int | str = "") -> None:
         if not self.silent:

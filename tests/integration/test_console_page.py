@@ -24,6 +24,7 @@ from faults.processes import small_mission
 from faults.scripted_ground import ScriptedGround
 from protocol.bus import connect
 from protocol.mission_file import mission_to_json
+from protocol.obstacle_settings import Obstacles
 from protocol.operation_settings import CONSOLE_FILE, Console
 
 PATIENCE_S = 40.0
@@ -56,7 +57,7 @@ class Open:
 
     async def choose(self, now: str, then: str) -> None:
         """In the dropdown that shows ``now``."""
-        await self.page.locator(f"input[role=combobox][value='{now}']").click()
+        await self.page.locator(f'input[role=combobox][value="{now}"]').click()
         await self.page.get_by_role("option", name=then, exact=True).click()
 
     async def press(self, button: str) -> None:
@@ -76,7 +77,9 @@ async def until(condition: Callable[[], bool]) -> None:
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
 async def opened(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Open]:
     run = tmp_path_factory.mktemp("run")
-    mission = small_mission(run, len(DRONES)).model_copy(update={"console": Console(port=0)})
+    mission = small_mission(run, len(DRONES))
+    flight = mission.flight.model_copy(update={"obstacles": Obstacles(enabled=True)})
+    mission = mission.model_copy(update={"console": Console(port=0), "flight": flight})
     (run / "mission.json").write_text(mission_to_json(mission))
     private = tmp_path_factory.mktemp("z", numbered=True)
     endpoint = socket_endpoint(private)
@@ -253,6 +256,24 @@ async def test_a_picture_of_the_page_is_kept(opened: Open, tmp_path: Path) -> No
 
     await opened.page.set_viewport_size(SMALL)
     assert opened.complaints == []
+
+
+async def test_the_free_space_is_cut_at_the_chosen_drone_and_at_a_height_of_ones_own(opened: Open) -> None:
+    await opened.page.get_by_role("tab", name="View").click()
+    height = opened.page.get_by_text("Height, m")
+    await expect(height).to_be_hidden()
+
+    await opened.choose("hidden", "at the drone's height")
+    await asyncio.sleep(DRAWN_S)
+    await opened.choose("at the drone's height", "at a height")
+    await expect(height).to_be_visible()
+    await asyncio.sleep(DRAWN_S)
+    await opened.choose("at a height", "hidden")
+    await expect(height).to_be_hidden()
+    await opened.page.get_by_role("tab", name="Why there?").click()
+
+    assert opened.complaints == []
+    assert "failed" not in opened.log.read_text()
 
 
 async def test_every_view_of_map_and_importance_is_drawn(opened: Open) -> None:

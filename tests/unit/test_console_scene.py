@@ -4,13 +4,19 @@ import math
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from faults.recorded import team
 from ground_station.console.drone_view import Trail, orientation
 from ground_station.console.field_view import FieldView, drone_colours, heat
+from ground_station.console.free_view import NEAR_M, FreeView
+from protocol.errors import MessageError
 from protocol.field import VirtualField
 from protocol.geometry import camera_rotation
 from protocol.importance import ImportanceField
-from protocol.mission import Sensing, Target
+from protocol.messages import FreeCells
+from protocol.mission import Flight, Sensing, Target
+from protocol.obstacle_settings import Obstacles
 
 SENSING = Sensing()
 
@@ -114,3 +120,73 @@ def test_drones_have_the_palettes_colours_over_and_over() -> None:
         drone_colours([0, 1, 8]), [(0x00, 0x72, 0xB2), (0xD5, 0x5E, 0x00), (0x00, 0x72, 0xB2)]
     )
     assert drone_colours([]).shape == (0, 3)
+
+
+def among_obstacles() -> tuple[FreeView, NDArray[np.bool_]]:
+    """A view that has heard a map, and what is free by it and by the mission."""
+    view = FreeView(team().model_copy(update={"flight": Flight(obstacles=Obstacles(enabled=True, cell_m=0.2))}))
+    seen = np.random.default_rng(1).random(view.grid.shape) < 0.8
+    assert view.take(FreeCells(tick=1, packed=view.grid.pack(seen)))
+    return view, seen | view.grid.vouched
+
+
+def test_a_cut_through_the_free_space_is_the_layer_of_cells_at_its_height() -> None:
+    view, free = among_obstacles()
+    grid = view.grid
+    for level in range(grid.shape[2]):
+        height_m = float(grid.origin[2]) + grid.cell_m * (level + 0.3)
+        assert view.level(height_m) == level
+        cut = view.cut(level)
+        np.testing.assert_array_equal(cut.free, free[:, :, level])
+        assert abs(cut.height_m - height_m) < grid.cell_m
+    assert view.level(-100.0) == 0
+    above = view.cut(view.level(100.0))
+    assert above.free.all(), "the crew vouches for it"
+    assert len(above.borders) == 0
+    assert above.height_m > grid.origin[2] + grid.cell_m * grid.shape[2]
+
+
+def test_each_border_lies_between_a_cell_that_is_free_and_one_that_is_not() -> None:
+    view, free = among_obstacles()
+    layer = free[:, :, 3]
+    borders = view.cut(3).borders
+    assert len(borders) == np.diff(layer, axis=0).sum() + np.diff(layer, axis=1).sum()
+    middles = borders.mean(axis=1)[:, :2]
+    across = np.diff(borders, axis=1)[:, 0, 1::-1]
+    np.testing.assert_allclose(np.abs(across).sum(axis=1), view.grid.cell_m, rtol=1e-4)
+    sides = [
+        layer[tuple(np.floor((middles + sign * across / 2 - view.grid.origin[:2]) / view.grid.cell_m).astype(int).T)]
+        for sign in (-1, 1)
+    ]
+    assert (sides[0] != sides[1]).all()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_nothing_that_is_not_free_is_nearer_than_what_is_said_to_be(seed: int) -> None:
+    view, free = among_obstacles()
+    grid = view.grid
+    place = grid.origin + grid.cell_m * np.array(grid.shape) * np.random.default_rng(seed).random(3)
+    nearest = view.nearest(place)
+    assert nearest is not None
+    lows = grid.origin + grid.cell_m * np.argwhere(~free)
+    distances = np.linalg.norm(np.clip(place, lows, lows + grid.cell_m) - place, axis=1)
+    assert nearest.distance_m == pytest.approx(distances.min())
+    assert np.linalg.norm(nearest.point - place) == pytest.approx(nearest.distance_m)
+    assert (nearest.low - 1e-9 <= nearest.point).all()
+    assert (nearest.point <= nearest.low + grid.cell_m + 1e-9).all()
+    assert any(np.allclose(nearest.low, low) for low in lows)
+
+
+def test_far_above_what_is_not_free_nothing_is_near() -> None:
+    view, _ = among_obstacles()
+    top_m = float(view.grid.origin[2]) + view.grid.cell_m * view.grid.shape[2]
+    assert view.nearest(np.array([0.0, 0.0, top_m + NEAR_M + 0.01])) is None
+
+
+def test_the_free_space_is_drawn_anew_only_when_it_has_changed() -> None:
+    view, free = among_obstacles()
+    assert not view.take(None)
+    assert not view.take(FreeCells(tick=2, packed=view.grid.pack(free)))
+    assert view.take(FreeCells(tick=3, packed=view.grid.pack(np.zeros_like(free))))
+    with pytest.raises(MessageError):
+        view.take(FreeCells(tick=4, packed=b"rubbish"))

@@ -21,6 +21,7 @@ from protocol import messages, topics
 from protocol.errors import StorageError
 from protocol.field import VirtualField
 from protocol.mission import Mission
+from protocol.obstacle_grid import ObstacleGrid
 from protocol.operation_settings import Recording as RecordingSettings
 from protocol.replication import Integrated
 
@@ -63,6 +64,7 @@ def test_players_schemas_are_foxgloves_and_ours_have_names(flown: tuple[Path, Fl
     assert schemas["/drone/1/camera"] == "foxglove.CompressedImage"
     assert schemas["/drone/1/calibration"] == "foxglove.CameraCalibration"
     assert schemas["/map"] == "foxglove.SceneUpdate"
+    assert schemas["/map/free"] == "foxglove.PointCloud"
     assert schemas["/log"] == "foxglove.Log"
     assert schemas["/drone/1/state"] == "covrecon.DroneState"
     assert schemas["/phi/jump"] == "covrecon.Jump"
@@ -141,18 +143,21 @@ def test_iterators_may_be_left_before_their_end(flown: tuple[Path, Flight]) -> N
     assert next(iter(recording.states(1))).tick == 0
 
 
-def test_maps_and_phi_are_recorded_once_a_period(tmp_path: Path) -> None:
+def test_maps_free_space_and_phi_are_recorded_once_a_period(tmp_path: Path) -> None:
     mission = team()
     random = np.random.default_rng(1)
     phi = random.random(VirtualField.of(mission.target).shape, dtype=np.float32)
     mean = phi.mean(axis=1)
+    grid = ObstacleGrid.of(mission)
     period = round(mission.recording.mesh_period_s / mission.tick_s)
     with Recorder(tmp_path / "a.mcap", mission, lossless=True) as recorder:
         for tick in range(100, 100 + 2 * period + 1):
             recorder.phi(tick, phi)
             recorder.mesh(tick, a_mesh(random))
+            recorder.free(tick, grid, grid.vouched)
         phi[:] = 0  # the caller goes on with it
     recording = Recording.open(tmp_path / "a.mcap")
+    assert recording.counts()["/map/free"] == 3
     assert [tick for tick, _ in recording.meshes()] == [100, 100 + period, 100 + 2 * period]
     with (tmp_path / "a.mcap").open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 import math
+from itertools import product
 
 import foxglove.messages
 import numpy as np
@@ -17,6 +18,7 @@ from ground_station.recording.stored import StoredJump, StoredKeyframe, schema_o
 from ground_station.results import Metrics
 from protocol import messages
 from protocol.geometry import Floats, camera_rotation
+from protocol.obstacle_grid import ObstacleGrid
 
 
 def decoded(message: object) -> object:
@@ -69,6 +71,28 @@ def test_points_are_coloured_by_their_importance() -> None:
     assert [data[0, offsets[name]] for name in ("red", "green", "blue", "alpha")] == [13, 8, 135, 255]
     assert [data[2, offsets[name]] for name in ("red", "green", "blue", "alpha")] == [240, 249, 33, 255]
     assert data[1, offsets["z"] : offsets["z"] + 4].tobytes() == np.float32(6).tobytes()
+
+
+def test_free_space_ends_where_a_cell_that_is_free_meets_one_that_is_not() -> None:
+    grid = ObstacleGrid(np.array([1.0, -2.0, 0.5]), 0.25, (5, 4, 3), np.zeros((5, 4, 3), np.bool_))
+    seen = np.zeros(grid.shape, np.bool_)
+    seen[2, 1:, 0] = True
+    grid.vouched[2, 2, 1] = True
+    free = seen | grid.vouched
+    wanted = set()
+    for index in product(*map(range, grid.shape)):
+        for axis, step in product(range(3), (-1, 1)):
+            other = list(index)
+            other[axis] += step
+            above = other[2] == grid.shape[2]
+            inside = all(0 <= at < count for at, count in zip(other, grid.shape, strict=True))
+            if not free[index] and (above or (inside and free[tuple(other)])):
+                wanted.add(tuple((grid.origin + grid.cell_m * (np.array(index) + 0.5)).tolist()))
+    cloud = decoded(shapes.free_surface(grid, seen, 0))
+    assert [(field.name, field.offset) for field in cloud.fields] == [("x", 0), ("y", 4), ("z", 8)]  # type: ignore[attr-defined]
+    places = np.frombuffer(cloud.data, "<f4").reshape(-1, cloud.point_stride // 4)  # type: ignore[attr-defined]
+    assert len(places) == len(wanted)
+    assert set(map(tuple, places.tolist())) == wanted
 
 
 def test_events_keep_their_level_and_say_who_speaks() -> None:
