@@ -207,10 +207,9 @@ class Scene:
         grid = view.grid
         width, height = (grid.cell_m * count for count in grid.shape[:2])
         cells = np.where(cut.free[..., None], *(np.array(rgba, np.uint8) for rgba in (FREE_COLOUR, NOT_FREE_COLOUR)))
-        rows = cells.transpose(1, 0, 2)[::-1]  # a picture's first row is the one farthest along y
         self._scene.add_image(
             "/free/cut",
-            rows.repeat(PIXELS, axis=0).repeat(PIXELS, axis=1),
+            cells.transpose(1, 0, 2).repeat(PIXELS, axis=0).repeat(PIXELS, axis=1),  # its first row at the lowest y
             width,
             height,
             cast_shadow=False,

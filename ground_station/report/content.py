@@ -54,6 +54,8 @@ class DroneRow:
     """How many ticks, and for which reasons."""
     battery: str
     """At the end, in percent."""
+    contacts: str
+    """With the scene."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +92,7 @@ def kpis(run: Run) -> list[Kpi]:
         Kpi("Importance J", number(figure(run, "J", "importance"), 3), _threshold_note(run)),
         *(_score_kpi(run, name) for name in SURFACES),
         _separation_kpi(run),
+        *_contacts_kpi(run),
         Kpi("Jumps", number(jumps, 0), "no feedback" if method == "none" else f"{method} feedback"),
         Kpi("Keyframes", number(keyframes, 0), "no reconstruction" if backend == "none" else backend.replace("_", " ")),
         *_time_kpis(run),
@@ -121,6 +124,21 @@ def _separation_kpi(run: Run) -> Kpi:
     return Kpi(
         "Nearest approach", number(nearest, 3, " m"), f"limit {limit:g} m", "good" if nearest >= limit else "bad"
     )
+
+
+def _contacts(run: Run) -> Mapping[str, int] | None:
+    """By drone; None where nobody counted, and in summaries that were written before anybody did."""
+    contacts: Mapping[str, int] | None = (run.summary or {}).get("contacts")
+    return contacts
+
+
+def _contacts_kpi(run: Run) -> Iterator[Kpi]:
+    contacts = _contacts(run)
+    if contacts is not None:
+        count = sum(contacts.values())
+        touched = ", ".join(drone for drone, times in contacts.items() if times)
+        note = f"of drones {touched}" if touched else "of no drone"
+        yield Kpi("Contacts with the scene", f"{count:,}", note, "bad" if count else "good")
 
 
 def _time_kpis(run: Run) -> Iterator[Kpi]:
@@ -172,6 +190,7 @@ def _drone_row(run: Run, flight: Flight, index: int) -> DroneRow:
     distance = run.curves.get(f"separation_{drone}_m", np.empty(0))
     distance = distance[np.isfinite(distance)]
     battery = flight.battery[np.isfinite(flight.battery[:, index]), index]
+    contacts = _contacts(run)
     reasons = Counter(reason for reason in flight.fallback[:, index].tolist() if reason)
     named = ", ".join(f"{reason} {count:,}" for reason, count in sorted(reasons.items()))
     return DroneRow(
@@ -185,6 +204,7 @@ def _drone_row(run: Run, flight: Flight, index: int) -> DroneRow:
         slack=f"{slack.max():.3g}" if len(slack) else UNKNOWN,
         fallbacks=f"{reasons.total():,} ({named})" if reasons else "0",
         battery=number(100 * float(battery[-1]) if len(battery) else math.nan, 0, " %"),
+        contacts=UNKNOWN if contacts is None else f"{contacts.get(str(drone), 0):,}",
     )
 
 

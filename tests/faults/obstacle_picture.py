@@ -9,6 +9,7 @@ is read from the flight's last checkpoint, so it is a few seconds older than the
 from __future__ import annotations
 
 import argparse
+import io
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,6 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
+from PIL import Image
 
 from faults.obstacle_study import SECONDS, fly
 from ground_station.checkpoint import load_checkpoint
@@ -34,11 +36,12 @@ from sim_bridge.scenes.scene import load_scene
 
 PICTURE = Path("docs/images/obstacles.png")
 INCHES, DPI = (11.0, 5.9), 110
-HEIGHT_M = 0.7
+COLOURS = 64
+HEIGHT_M = 1.0
+NEAR_M = 0.3
+"""From the cut: a path so near to it is drawn thick, because it goes around what is drawn, or into it."""
 FREE, NOT_FREE, FURNITURE, INK = "#ffffff", "#f6d5d0", "#5b4a42", "#1f2933"
 CONTACT = "#c62828"
-LOW_M = 1.5
-"""Below it a path may meet furniture: drawn thick."""
 
 
 def cut(triangles: NDArray[np.float32], height_m: float) -> Floats:
@@ -98,9 +101,10 @@ def draw(axes: Axes, mission: Mission, run: Path, height_m: float) -> None:
     for (x, y), (other_x, other_y) in cut(triangles, height_m):
         axes.plot([x, other_x], [y, other_y], color=FURNITURE, linewidth=1.6, solid_capstyle="round", zorder=2)
     for index in range(paths.shape[1]):
-        path, low = paths[:, index], paths[:, index, 2:] < LOW_M
+        path = paths[:, index]
+        near = np.abs(path[:, 2:] - height_m) < NEAR_M
         axes.plot(*path[:, :2].T, color=drone_colour(index), linewidth=0.6, alpha=0.55, zorder=3)
-        axes.plot(*np.where(low, path[:, :2], np.nan).T, color=drone_colour(index), linewidth=1.8, zorder=4)
+        axes.plot(*np.where(near, path[:, :2], np.nan).T, color=drone_colour(index), linewidth=1.8, zorder=4)
     met = touches(mission, triangles, paths)
     axes.scatter(*met[:, :2].T, s=150, marker="X", color=CONTACT, edgecolors="white", linewidths=1.0, zorder=6)
     title = f"with obstacle rows: {len(met)} contacts" if obstacles else f"without: {len(met)} contacts"
@@ -108,7 +112,7 @@ def draw(axes: Axes, mission: Mission, run: Path, height_m: float) -> None:
     if obstacles:
         axes.set_xlabel(f"what {tick * mission.tick_s:.0f} s of flight have seen free at {height_m:g} m", color=INK)
     else:
-        axes.set_xlabel("nobody asks", color=INK)
+        axes.set_xlabel("no drone knows what is free", color=INK)
     walls = max(map(abs, np.ravel(mission.flight.boundary or 3.4))) + 0.25
     axes.set(xlim=(-walls, walls), ylim=(-walls, walls), xticks=[], yticks=[], aspect="equal")
 
@@ -126,16 +130,18 @@ def main(arguments: Sequence[str]) -> None:
         run = asked.folder / f"room-{asked.room}-{'with' if enabled else 'without'}" / "latest"
         draw(axes, read_mission(run), run.resolve(), asked.height)
     handles = [
-        Patch(facecolor=NOT_FREE, label="not free: furniture, or not seen"),
+        Patch(facecolor=NOT_FREE, label="not free: a thing, or not seen"),
         Line2D([], [], color=FURNITURE, linewidth=1.6, label=f"furniture and walls at {asked.height:g} m"),
-        Line2D([], [], color=drone_colour(0), linewidth=1.8, label=f"path of a drone below {LOW_M:g} m"),
-        Line2D([], [], color=drone_colour(0), linewidth=0.6, alpha=0.55, label="above it"),
+        Line2D([], [], color=drone_colour(0), linewidth=1.8, label=f"a drone within {NEAR_M:g} m of that height"),
+        Line2D([], [], color=drone_colour(0), linewidth=0.6, alpha=0.55, label="above or below"),
         Line2D(
             [], [], marker="X", color=CONTACT, markeredgecolor="white", markersize=11, linestyle="", label="contact"
         ),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
-    figure.savefig(asked.out, dpi=DPI)
+    pixels = io.BytesIO()
+    figure.savefig(pixels, dpi=DPI)
+    Image.open(pixels).convert("RGB").quantize(COLOURS).save(asked.out, optimize=True)
     print(asked.out)
 
 

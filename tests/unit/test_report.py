@@ -54,7 +54,13 @@ def a_table_on_a_floor() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def flown(
-    folder: Path, mission: Mission, *, mapped: bool = True, scores: Scores | None = SCORES, finished: bool = True
+    folder: Path,
+    mission: Mission,
+    *,
+    mapped: bool = True,
+    scores: Scores | None = SCORES,
+    finished: bool = True,
+    contacts: dict[int, int] | None = None,
 ) -> Path:
     """The folder of a run of ``TICKS`` ticks: drones on circles, J falling, jumps below the threshold."""
     run = RunFolder(folder, mission)
@@ -91,6 +97,7 @@ def flown(
             phi_sha256="9f" * 32,
             wall_time_s=3.8,
             exit_reason="duration of 20 s reached",
+            contacts=contacts,
         )
     run.close()
     return folder
@@ -166,6 +173,17 @@ def test_a_complete_run_is_told_in_full(tmp_path: Path) -> None:
         "2.5 s", "0.1 s", "drone 3", "braked for 2 ticks: infeasible 2"
     ]  # fmt: skip
     assert {"[sensing]", "sigma_axis", "0.07", "9f" * 32} <= set(shown.words)
+
+
+def test_contacts_with_the_scene_are_told_by_drone_where_somebody_counted(tmp_path: Path) -> None:
+    touched = page_of(flown(tmp_path / "touched", team(3), contacts={1: 0, 2: 1203, 3: 4})).words
+    at = touched.index("Contacts with the scene")
+    assert touched[at + 1 : at + 3] == ["1,207", "of drones 2, 3"]
+    assert touched.count("1,203") == 1
+    clear = page_of(flown(tmp_path / "clear", team(2), contacts={1: 0, 2: 0})).words
+    at = clear.index("Contacts with the scene")
+    assert clear[at + 1 : at + 3] == ["0", "of no drone"]
+    assert "Contacts with the scene" not in page_of(flown(tmp_path / "unjudged", team(2))).words
 
 
 def test_paths_are_drawn_with_the_zones_that_were_flown_around(tmp_path: Path) -> None:
