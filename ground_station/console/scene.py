@@ -186,19 +186,19 @@ class Scene:
         if self._free is None:
             return
         style, state = self._options.free, situation.states().get(chosen)
-        if style == "hidden" or (style == "at the drone's height" and state is None):
+        place = None if state is None else state.pose[:3]
+        height_m = self._options.height_m if style == "at a height" else place and place[2]
+        if style == "hidden" or height_m is None:
             self._scene.remove_by_name("/free")
             self._cut = self._near = None
             return
         changed = self._free.take(situation.free)
-        at_drone = state is not None and style == "at the drone's height"
-        level = self._free.level(state.pose[2] if at_drone else self._options.height_m)
+        level = self._free.level(height_m)
         if changed or level != self._cut:
             if self._cut is None:
                 self._scene.add_frame("/free", show_axes=False)
             self._draw_cut(self._free.cut(level), self._free)
             self._cut = level
-        place = None if state is None else state.pose[:3]
         if changed or place != self._near:
             self._near = place
             self._draw_nearest(self._free, place)
