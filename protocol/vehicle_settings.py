@@ -94,7 +94,10 @@ class Autopilot(Settings):
     position_noise_m: NonNegative = 0.02
     """Standard deviation of the estimate's slow wandering, each axis."""
     battery_s: Positive = 1200.0
-    """Flight time of a full battery."""
+    """Flight time of a full battery. The crew changes it by ``vehicles.battery_swap_s`` and ``battery_spares``."""
+    power_off_s: NonNegative = 0.0
+    """For how long that takes the power from the autopilot, which then boots: no link, and then a local frame that
+    begins anew. 0: it is fed meanwhile."""
     gimbal_rate_max_radps: Positive = 2.0
     """How fast the gimbal slews."""
     spool_up_s: NonNegative = 1.5

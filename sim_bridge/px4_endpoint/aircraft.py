@@ -1,4 +1,8 @@
-"""One vehicle without its link: what PX4 and the airframe do from step to step. Time is given, nothing is sent."""
+"""One vehicle without its link: what PX4 and the airframe do from step to step. Time is given, nothing is sent.
+
+What loses its power when a battery is changed begins anew in `Aircraft._boot`; what does not, it keeps: the airframe,
+its place, and PX4's parameters.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +27,8 @@ Pose: TypeAlias = tuple[float, float, float, float, float]
 
 HOME: Geodetic = (47.397742, 8.545594, 488.0)
 """Origin of a world that says none: where PX4's own simulation stands."""
+KNOWS_BATTERY_S = 2.0
+"""After booting, until the share of the battery is known."""
 LIFTING = (Mode.TAKEOFF, Mode.OFFBOARD, Mode.MANUAL, Mode.ALTCTL, Mode.POSCTL, Mode.STABILISED)
 """Modes that may leave the ground."""
 
@@ -32,35 +38,63 @@ class Aircraft:
     ``vehicles.origin``."""
 
     def __init__(self, mission: Mission, drone: Drone) -> None:
-        dice = np.random.default_rng([mission.seed, drone.id])
+        self._dice = dice = np.random.default_rng([mission.seed, drone.id])
         settings = mission.autopilot
         x, y, _, yaw, pitch = drone.start
-        world = mission.vehicles.origin or HOME
-        here = ned((x, y, 0.0))
-        origin = here if mission.vehicles.origin else (0.0, 0.0, 0.0)
+        self._settings, self._world = settings, mission.vehicles.origin
         self.parameters = Parameters()
         self.parameters.set("MAV_SYS_ID", drone.mavlink_system)
+        self.wind = Wind(settings, dice)
+        self.body = Body(ned((x, y, 0.0)), world_yaw(yaw))
+        self.battery = Battery(settings.battery_s, mission.vehicles.battery_swap_s, mission.vehicles.battery_spares)
+        self.gimbal = Gimbal(self.parameters, settings.gimbal_rate_max_radps)
+        self.faults: tuple[str, ...] = ()
+        """Red checks, by what PX4 calls them."""
+        self.power_off_s = settings.power_off_s
+        """How long changing the battery takes its power."""
+        self.tells_battery = True
+        """Whether the share of the battery is known."""
+        self.boots = 0
+        """How often it has begun anew."""
+        self.booted_s = 0.0
+        """Its time begins here; at first with the machine's, so that stamps of all vehicles compare."""
+        self.boot_error: Vector = (0.0, 0.0, 0.0)
+        """How far off its estimate begins after the next boot: north, east, down."""
+        self.now_s = 0.0
+        self._flight = mission.flight
+        self._fixed_pitch = pitch if mission.vehicles.camera_mount == "fixed" else None
+        self._push_until_s = self._off_until_s = -math.inf
+        self._boot()
+
+    def _boot(self) -> None:
+        """The autopilot begins: with a local frame of its own where it stands, but where all share one."""
+        here = self.body.position
+        origin = here if self._world else (0.0, 0.0, 0.0)
         self.commander = Commander(self.parameters)
         self.guidance = Guidance(self.parameters)
         self.guidance.home = (here[0] - origin[0], here[1] - origin[1], here[2] - origin[2])
-        self.ground = Ground(self.parameters, settings.spool_up_s)
-        self.wind = Wind(settings, dice)
-        self.body = Body(here, world_yaw(yaw))
-        self.estimator = Estimator(origin, settings.position_noise_m, dice)
-        self.battery = Battery(settings.battery_s)
-        self.gimbal = Gimbal(self.parameters, settings.gimbal_rate_max_radps)
-        self.origin: Geodetic = unproject(world, origin)
+        self.ground = Ground(self.parameters, self._settings.spool_up_s)
+        self.estimator = Estimator(origin, self._settings.position_noise_m, self._dice)
+        self.origin: Geodetic = unproject(self._world or HOME, origin)
         """Of the local frame: GPS_GLOBAL_ORIGIN."""
-        self.faults: tuple[str, ...] = ()
-        """Red checks, by what PX4 calls them."""
         self.commanded: Vector = (0.0, 0.0, 0.0)
-        self.now_s = 0.0
         self._setpoint_s = -math.inf
-        self._flight = mission.flight
-        self._fixed_pitch = pitch if mission.vehicles.camera_mount == "fixed" else None
         self._mode = self.commander.mode
         self._armed = False
-        self._push_until_s = -math.inf
+
+    @property
+    def is_off(self) -> bool:
+        """Whether it has no power."""
+        return self.now_s < self._off_until_s
+
+    @property
+    def up_s(self) -> float:
+        """Its own time."""
+        return self.now_s - self.booted_s
+
+    @property
+    def knows_battery(self) -> bool:
+        return self.tells_battery and (self.boots == 0 or self.up_s > KNOWS_BATTERY_S)
 
     @property
     def estimate(self) -> Estimate:
@@ -107,7 +141,11 @@ class Aircraft:
 
     def step(self, now_s: float, dt: float) -> None:
         """Advance by ``dt`` seconds to ``now_s``."""
-        self.now_s = now_s
+        was_off, self.now_s = self.is_off, now_s
+        if was_off:
+            if not self.is_off:
+                self._boot_again()
+            return
         if now_s > self._push_until_s:
             self.body.push = (0.0, 0.0, 0.0)
         self.wind.step(dt)
@@ -121,7 +159,15 @@ class Aircraft:
         else:
             self.ground.step(now_s, dt, armed_s=None, on_ground=self.body.on_ground, wanted_down=0.0)
             self.body.rest(dt)
+            if self.ground.landed and self.battery.stand(dt):
+                self._off_until_s = now_s + self.power_off_s
         self.gimbal.step(self.body.yaw, dt)
+
+    def _boot_again(self) -> None:
+        self.boots, self.booted_s = self.boots + 1, self.now_s
+        self.gimbal.release()
+        self._boot()
+        self.jump(self.boot_error)
 
     def _follow_commander(self) -> None:
         armed, mode = self.commander.armed, self.commander.mode

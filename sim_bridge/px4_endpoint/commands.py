@@ -179,7 +179,7 @@ class Commands:
 
     def _timesync(self, packet: Packet, now_s: float) -> Iterator[Packet]:
         if packet.tc1 == 0:
-            yield mavlink.MAVLink_timesync_message(int(now_s * 1e9), packet.ts1)
+            yield mavlink.MAVLink_timesync_message(int((now_s - self._aircraft.booted_s) * 1e9), packet.ts1)
 
 
 def status_texts(severity: int, text: str, number: int = 0) -> Iterator[Packet]:

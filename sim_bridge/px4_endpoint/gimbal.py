@@ -52,6 +52,10 @@ class Gimbal:
         self._wanted_yaw = 0.0
         self._rates = (0.0, 0.0)
 
+    def release(self) -> None:
+        """Its manager begins anew: nobody has control."""
+        self.controller, self.locked, self._rates = (0, 0), False, (0.0, 0.0)
+
     def configure(self, primary: tuple[float, float], source: tuple[int, int]) -> None:
         """DO_GIMBAL_MANAGER_CONFIGURE: hand out primary control."""
         system, component = (round(value) if math.isfinite(value) else KEEP for value in primary)

@@ -7,6 +7,10 @@ from sim_bridge.px4_endpoint.telemetry import STREAMS
 
 class Streams:
     def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Default rates, as after booting."""
         self._period_s = {message: 1.0 / rate for message, (rate, _) in STREAMS.items()}
         self._due_s = dict.fromkeys(self._period_s, 0.0)
 

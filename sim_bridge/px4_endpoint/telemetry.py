@@ -33,8 +33,8 @@ NAN = math.nan
 
 
 def milliseconds(aircraft: Aircraft) -> int:
-    """PX4's time since boot; here that of the machine, so that stamps of all vehicles compare."""
-    return int(aircraft.now_s * 1e3) & 0xFFFFFFFF
+    """PX4's time since boot; here, until it has booted again, that of the machine: stamps of all vehicles compare."""
+    return int(aircraft.up_s * 1e3) & 0xFFFFFFFF
 
 
 def heartbeat(aircraft: Aircraft) -> Packet:
@@ -59,7 +59,7 @@ def sys_status(aircraft: Aircraft) -> Packet:
     battery = aircraft.battery
     return mavlink.MAVLink_sys_status_message(
         present, present, healthy, 300, int(battery.cell_v * CELLS * 1e3), int(_current(aircraft) * 100),
-        math.ceil(battery.share * 100), 0, 0, 0, 0, 0, 0,
+        _per_cent(aircraft), 0, 0, 0, 0, 0, 0,
     )  # fmt: skip
 
 
@@ -123,7 +123,7 @@ def gps_raw_int(aircraft: Aircraft) -> Packet:
     fix, satellites = (mavlink.GPS_FIX_TYPE_NO_FIX, 0) if lost else (mavlink.GPS_FIX_TYPE_3D_FIX, 10)
     speed = int(math.hypot(here.velocity[0], here.velocity[1]) * 100)
     return mavlink.MAVLink_gps_raw_int_message(
-        int(aircraft.now_s * 1e6), fix, *_e7(latitude, longitude), int(height * 1e3), 80, 120, speed, UNKNOWN_16,
+        int(aircraft.up_s * 1e6), fix, *_e7(latitude, longitude), int(height * 1e3), 80, 120, speed, UNKNOWN_16,
         satellites,
     )  # fmt: skip
 
@@ -131,7 +131,7 @@ def gps_raw_int(aircraft: Aircraft) -> Packet:
 def gps_global_origin(aircraft: Aircraft) -> Packet:
     latitude, longitude, height = aircraft.origin
     return mavlink.MAVLink_gps_global_origin_message(
-        *_e7(latitude, longitude), round(height * 1e3), int(aircraft.now_s * 1e6)
+        *_e7(latitude, longitude), round(height * 1e3), int(aircraft.up_s * 1e6)
     )
 
 
@@ -140,7 +140,7 @@ def home_position(aircraft: Aircraft) -> Packet:
     place: Geodetic = unproject(aircraft.origin, home)
     return mavlink.MAVLink_home_position_message(
         *_e7(place[0], place[1]), round(place[2] * 1e3), *home, [1.0, 0.0, 0.0, 0.0], NAN, NAN, NAN,
-        int(aircraft.now_s * 1e6),
+        int(aircraft.up_s * 1e6),
     )  # fmt: skip
 
 
@@ -149,7 +149,7 @@ def battery_status(aircraft: Aircraft) -> Packet:
     cells = [int(battery.cell_v * 1e3)] * CELLS + [UNKNOWN_16] * (10 - CELLS)
     return mavlink.MAVLink_battery_status_message(
         0, mavlink.MAV_BATTERY_FUNCTION_ALL, mavlink.MAV_BATTERY_TYPE_LIPO, 2500, cells,
-        int(_current(aircraft) * 100), -1, -1, math.ceil(battery.share * 100),
+        int(_current(aircraft) * 100), -1, -1, _per_cent(aircraft),
         int(battery.share * battery.flight_s), mavlink.MAV_BATTERY_CHARGE_STATE_OK,
     )  # fmt: skip
 
@@ -197,6 +197,10 @@ def gimbal_device_attitude_status(aircraft: Aircraft) -> Packet:
         0, 0, milliseconds(aircraft), gimbal.flags, list(quaternion(0.0, gimbal.pitch.angle, gimbal.yaw.angle)),
         0.0, gimbal.pitch.rate, gimbal.yaw.rate, 0, aircraft.body.yaw, aircraft.body.yaw_rate, DEVICE,
     )  # fmt: skip
+
+
+def _per_cent(aircraft: Aircraft) -> int:
+    return math.ceil(aircraft.battery.share * 100) if aircraft.knows_battery else -1
 
 
 def _current(aircraft: Aircraft) -> float:

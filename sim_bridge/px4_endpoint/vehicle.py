@@ -9,6 +9,9 @@ Faults are methods and attributes, callable from any thread; `docs/px4.md` lists
 ``silent = True``                      it sends nothing more, but hears
 ``cut = True``                         it neither sends nor hears
 ``set_battery(share)``                 0 to 1
+``tells_battery = False``              it does not know its share
+``power_off_s = 3.0``                  how long changing the battery takes its power; 0: it is fed meanwhile
+``wake_elsewhere((x, y, z))``          after its next boot its estimate is off by this, world metres
 ``jump((x, y, z))``                    its position estimate moves at once, world metres; the vehicle does not
 ``push((x, y, z), seconds)``           it is carried along, world m/s, on top of what it flies: out of the fence, say
 ``gimbal_stuck = True``                the gimbal reports, but does not move
@@ -82,7 +85,13 @@ class Vehicle:
         """Advance the vehicle and send what is due."""
         while self._orders:
             self._orders.popleft()()
+        boots = self.aircraft.boots
         self.aircraft.step(now_s, dt)
+        if self.aircraft.is_off:
+            return
+        if self.aircraft.boots > boots:
+            self._streams.reset()
+            log.info("drone %d: booted", self.drone.id)
         self._tell()
         gimbal_silent = self.aircraft.gimbal.silent
         for message in self._streams.due(now_s):
@@ -91,7 +100,10 @@ class Vehicle:
 
     def read(self, now_s: float) -> None:
         """Act on what has come in."""
-        for packet in self.link.receive():
+        packets = self.link.receive()
+        if self.aircraft.is_off:
+            return
+        for packet in packets:
             for answer in self._commands.handle(packet, now_s):
                 self.link.send(answer)
         self._tell()
@@ -131,6 +143,25 @@ class Vehicle:
 
     def set_battery(self, share: float) -> None:
         self.aircraft.battery.share = share
+
+    @property
+    def tells_battery(self) -> bool:
+        return self.aircraft.tells_battery
+
+    @tells_battery.setter
+    def tells_battery(self, value: bool) -> None:
+        self.aircraft.tells_battery = value
+
+    @property
+    def power_off_s(self) -> float:
+        return self.aircraft.power_off_s
+
+    @power_off_s.setter
+    def power_off_s(self, value: float) -> None:
+        self.aircraft.power_off_s = value
+
+    def wake_elsewhere(self, by: Vector) -> None:
+        self.aircraft.boot_error = ned(by)
 
     def jump(self, by: Vector) -> None:
         self._orders.append(lambda: self.aircraft.jump(ned(by)))

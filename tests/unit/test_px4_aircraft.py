@@ -10,6 +10,7 @@ import pytest
 from protocol.mission import Drone, Mission
 from protocol.vehicle_settings import Autopilot, Vehicles
 from sim_bridge.px4_endpoint.aircraft import HOME, Aircraft
+from sim_bridge.px4_endpoint.battery import Battery
 from sim_bridge.px4_endpoint.frames import world_yaw
 from sim_bridge.px4_endpoint.guidance import Target
 from sim_bridge.px4_endpoint.modes import Mode
@@ -24,10 +25,16 @@ class Flight:
     """An aircraft and its time; ``setpoint`` is repeated at every step, as long as there is one."""
 
     def __init__(
-        self, *, origin: tuple[float, float, float] | None = ORIGIN, settings: Autopilot = QUIET, **parameters: float
+        self,
+        *,
+        origin: tuple[float, float, float] | None = ORIGIN,
+        settings: Autopilot = QUIET,
+        swap_s: float = 0.0,
+        **parameters: float,
     ) -> None:
         drone = Drone(id=1, start=START)
-        mission = Mission(drones=(drone,), vehicles=Vehicles(kind="px4", origin=origin), autopilot=settings)
+        vehicles = Vehicles(kind="px4", origin=origin, battery_swap_s=swap_s)
+        mission = Mission(drones=(drone,), vehicles=vehicles, autopilot=settings)
         self.aircraft = Aircraft(mission, drone)
         for name, value in {"COM_OBL_RC_ACT": 5, "MIS_TAKEOFF_ALT": 2.0, **parameters}.items():
             self.aircraft.parameters.set(name, value)
@@ -249,3 +256,71 @@ def test_it_holds_within_what_its_estimate_is_worth() -> None:
     flight.take_off()
     flight.run(10)
     assert 0 < math.dist(flight.aircraft.pose[:3], (START[0], START[1], 2.0)) < 0.4
+
+
+def swapped(power_off_s: float) -> Flight:
+    """It has flown elsewhere and stands there, its battery changed a second ago or just now."""
+    flight = Flight(settings=Autopilot(position_noise_m=0.0, battery_s=60.0, power_off_s=power_off_s), swap_s=3.0)
+    aircraft = flight.aircraft
+    aircraft.gimbal.configure((245, 190), (245, 190))
+    flight.take_off()
+    flight.fly(0.5, 0.0, 0.0)
+    flight.run(2.0)
+    flight.setpoint = None
+    assert flight.command(Mode.LAND)
+    flight.until(lambda: not aircraft.commander.armed, 20.0)
+    assert aircraft.battery.share < 0.9
+    flight.run(2.9)
+    assert aircraft.battery.share < 0.9, "the crew is at it"
+    flight.run(0.2)
+    assert aircraft.battery.share == 1.0
+    return flight
+
+
+def test_an_autopilot_that_is_fed_goes_on_with_another_battery() -> None:
+    flight = swapped(power_off_s=0.0)
+    aircraft, origin = flight.aircraft, flight.aircraft.origin
+    assert not aircraft.is_off
+    flight.run(10.0)
+    assert (aircraft.boots, aircraft.booted_s, aircraft.origin) == (0, 0.0, origin)
+    assert aircraft.gimbal.controller == (245, 190)
+    assert aircraft.knows_battery
+    assert aircraft.battery.share == 1.0
+
+
+def test_an_autopilot_without_power_begins_anew_where_it_stands() -> None:
+    flight = swapped(power_off_s=4.0)
+    aircraft, began = flight.aircraft, flight.aircraft.origin
+    place = aircraft.body.position
+    assert aircraft.is_off
+    flight.until(lambda: not aircraft.is_off, 4.1)
+    assert aircraft.boots == 1
+    assert aircraft.up_s == pytest.approx(0.0, abs=2 * DT)
+    assert not aircraft.knows_battery
+    assert aircraft.gimbal.controller == (0, 0), "nobody"
+    assert aircraft.parameters["COM_OBL_RC_ACT"] == 5, "it keeps its parameters"
+    assert aircraft.estimate.position == pytest.approx((0.0, 0.0, 0.0)), "of its own local frame"
+    assert aircraft.body.position == place
+    north_m = math.radians(aircraft.origin[0] - began[0]) * 6_371_000.0
+    assert north_m > 0.5, "which lies elsewhere now"
+    flight.run(2.1)
+    assert aircraft.knows_battery
+    flight.take_off()
+
+
+def test_it_may_wake_up_elsewhere() -> None:
+    flight = swapped(power_off_s=1.0)
+    flight.aircraft.boot_error = (0.0, 2.0, 0.0)
+    flight.run(1.1)
+    assert flight.aircraft.estimate.position == pytest.approx((0.0, 2.0, 0.0))
+
+
+def test_nobody_changes_a_battery_that_has_not_flown_or_without_a_spare() -> None:
+    flight = Flight(settings=QUIET, swap_s=3.0)
+    flight.aircraft.battery.share = 0.5
+    flight.run(5.0)
+    assert flight.aircraft.battery.share == 0.5
+    battery = Battery(10.0, swap_s=1.0, spares=1)
+    for full in (True, False):
+        battery.drain(2.0)
+        assert any(battery.stand(0.5) for _ in range(4)) is full
