@@ -234,10 +234,12 @@ class Agent:
         order = self._give_orders(telemetry, condition)
         if telemetry is not None and self._swap.is_done(telemetry, condition.authority, self._operator):
             condition = self._fly_again(telemetry, condition)
+        if telemetry is not None and condition.authority == "landed":
+            telemetry = self._stands(telemetry)
         may_start = condition.authority == "ready" and not self._finished and order.action == "wait"
         if may_start and self._way_up_is_free(telemetry, tick.tick):
             self._vehicle.take_off()  # the first tick is the order to start
-        if telemetry is None or not self._is_sound(telemetry):
+        if telemetry is None or not self._is_sound(telemetry, condition):
             self._step_blindly(telemetry, tick, order)
             return
         if self._blind:
@@ -286,7 +288,7 @@ class Agent:
         silence = None if self._lockstep else (self._ground_heard_s, self._now_s())
         if condition.authority == "landed":
             self._reserve.land()
-        elif condition.authority == "ours" and telemetry is not None and self._is_sound(telemetry):
+        elif condition.authority == "ours" and telemetry is not None and self._is_sound(telemetry, condition):
             self._reserve.look(telemetry)
         order = self._orders.give(
             telemetry,
@@ -307,6 +309,10 @@ class Agent:
         self._swap.renew(telemetry.stamp_s)
         self._homecoming = Homecoming(self._mission, self._drone, self._planner, self._watch.obstacles)
         return self._vehicle.condition()
+
+    def _stands(self, telemetry: Telemetry) -> Telemetry:
+        """Of one that has landed; what it said last may be from before it stood still."""
+        return self._swap.as_it_stands(replace(telemetry, velocity=np.zeros(5)))
 
     def _way_up_is_free(self, telemetry: Telemetry | None, tick: int) -> bool:
         """At first all take off together, each at its place; later others may be about."""
@@ -397,10 +403,13 @@ class Agent:
             return "joining"
         return "braking" if self._control is not None and self._control.outcome != "solved" else "flying"
 
-    def _is_sound(self, telemetry: Telemetry) -> bool:
-        """Alive, fresh and valid, in simulation too."""
+    def _is_sound(self, telemetry: Telemetry, condition: Condition) -> bool:
+        """Alive, fresh and valid, in simulation too. One that has landed stands where it was, though it be silent: its
+        battery may be out."""
         fresh = self._clock.now_s() - telemetry.stamp_s <= self._mission.vehicles.telemetry_stale_s
-        return fresh and bool(np.isfinite(telemetry.pose).all() and np.isfinite(telemetry.velocity).all())
+        return (fresh or condition.authority == "landed") and bool(
+            np.isfinite(telemetry.pose).all() and np.isfinite(telemetry.velocity).all()
+        )
 
     def _state_of(self, telemetry: Telemetry, tick: int, mode: Mode, blind_s: float) -> DroneState:
         return DroneState(

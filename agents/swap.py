@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -48,7 +49,7 @@ class Swap:
         self._cause, self._stays = "", False
         self._landed: tuple[Floats, float, int] | None = None
         """Place (3,), least share, and number of the newest order since it has stood on the ground."""
-        self._full_told = self._displaced_told = False
+        self._full_told = self._displaced_told = self._is_displaced = False
         self._ready_s = math.inf
         self.count = 0
         """Batteries changed so far."""
@@ -76,22 +77,32 @@ class Swap:
             self._landed = telemetry.pose[:3].copy(), telemetry.battery, operator.number
         place, least, number = self._landed
         self._landed = place, min(least, telemetry.battery), number
-        if telemetry.battery < min(1.0, least + RISE) or telemetry.battery <= self._enough:
-            return False
         moved_m = math.dist(place, telemetry.pose[:3])
-        if moved_m > max(MOVED_M, 3 * telemetry.position_sd_m):
+        self._is_displaced = moved_m > max(MOVED_M, 3 * telemetry.position_sd_m)
+        if self._is_displaced:
             if not self._displaced_told:
                 self._tell("error", "battery", f"its estimate moved by {moved_m:.1f} m on the ground: stays there")
                 self._displaced_told = True
+            return False
+        if telemetry.battery < min(1.0, least + RISE) or telemetry.battery <= self._enough:
             return False
         if not self._full_told:
             self._tell("info", "battery", f"another battery is in, at {telemetry.battery:.0%}")
             self._full_told = True
         return self._by_itself or (operator.number > number and operator.action == "fly")
 
+    def as_it_stands(self, telemetry: Telemetry) -> Telemetry:
+        """What the others are told: one that no longer knows its place stands where it landed."""
+        if self._landed is None or not self._is_displaced:
+            return telemetry
+        pose = telemetry.pose.copy()
+        pose[:3] = self._landed[0]
+        return replace(telemetry, pose=pose)
+
     def renew(self, now_s: float) -> None:
         """The vehicle is ready to fly on, from ``now_s``, by the clock of the telemetry's stamps."""
         self._cause, self._landed, self._full_told, self._ready_s = "", None, False, now_s
+        self._displaced_told = False
         self._spares = None if self._spares is None else self._spares - 1
         self.count += 1
 

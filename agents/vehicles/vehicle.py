@@ -95,7 +95,8 @@ class Vehicle(Protocol):
 
     def make_ready(self) -> bool:
         """It stands on the ground with another battery: from "landed" to "ready", as before its first take-off. False
-        when it has not landed, or is armed: then nothing happens."""
+        when it has not landed, or is armed, or while it is checked again, which begins with the first call: then
+        nothing happens, and one may ask again."""
         ...
 
     def leave(self, *, hold: bool) -> None:

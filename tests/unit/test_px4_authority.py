@@ -236,3 +236,20 @@ def test_a_landed_vehicle_with_another_battery_takes_off_as_at_first(ours: Fligh
     assert ours.see(1.0, mode="HOLD") == ["offboard"]
     ours.see(mode="OFFBOARD")
     assert ours.authority == "ours"
+
+
+def test_a_vehicle_that_falls_silent_on_the_ground_may_have_been_switched_off(ours: Flight) -> None:
+    ours.see(4.0, silent=True, sends=True)
+    assert ours.authority == "lost"
+    assert ours.logic.silences == 0, "in the air it has not"
+    ours.see(mode="OFFBOARD", sends=True)
+    ours.logic.land(direct=False)
+    ours.see(1.0, mode="LAND")
+    ours.see(on_ground=True, height_m=0.0, armed=False, mode="HOLD")
+    assert ours.authority == "landed"
+    for count in (1, 2):
+        ours.see(4.0, silent=True)
+        assert ours.logic.silences == count, "once for each silence"
+        assert ours.authority == "landed", "it stands where it stood"
+        ours.see(1.0)
+    assert ours.logic.make_ready(ours.now_s)

@@ -198,3 +198,11 @@ def test_an_estimate_that_moves_faster_than_the_vehicle_can_has_jumped() -> None
     assert is_jump(motion(0.0, 0.0), motion(0.6, 0.02), 0.9, 0.5)
     assert not is_jump(motion(0.0, 0.0), motion(2.0, 2.0), 0.9, 0.5), "after a silence it may be elsewhere"
     assert not is_jump(motion(0.0, 0.0, 12.0), motion(1.0, 0.1, 12.0), 0.9, 0.5), "a pilot may fly faster"
+
+
+def test_before_another_flight_a_vehicle_may_stand_elsewhere_than_at_its_start() -> None:
+    away = replace(FINE, position=np.array([9.0, 9.0, 0.0]))
+    assert set(faults(away)) == {"start place"}
+    again = checklist(away, MISSION, 3, AIM, again=True)
+    assert red(again) == []
+    assert "start height" in [item.name for item in again]

@@ -122,6 +122,18 @@ def test_who_thinks_to_have_moved_on_the_ground_stays_there() -> None:
     assert len(said) == 2
 
 
+def test_to_the_others_who_no_longer_knows_its_place_stands_where_it_landed() -> None:
+    swap, said = swap_of()
+    assert not swap.is_done(telemetry(0.3), "landed", fly())
+    elsewhere = telemetry(0.3, x_m=START[0] + 2.0)
+    assert not swap.is_done(elsewhere, "landed", fly())
+    assert said[-1] == "error battery: its estimate moved by 2.0 m on the ground: stays there", "whatever its battery"
+    assert swap.as_it_stands(elsewhere).pose[0] == START[0]
+    back = telemetry(1.0, x_m=START[0] + 0.1)
+    assert swap.is_done(back, "landed", fly())
+    assert swap.as_it_stands(back) is back
+
+
 def neighbour(*place: float, age_s: float = 0.0) -> Neighbour:
     return Neighbour(2, np.array(place), age_s)
 

@@ -80,6 +80,9 @@ class AuthorityLogic:
         """What the vehicle acknowledged last without doing it, for people; stays until it is something else."""
         self._seen: Observation | None = None
         self._silence = WitnessedSilence()
+        self._was_silent = False
+        self.silences = 0
+        """How often it fell silent on the ground after a flight: its power may have been off."""
         self._land_ordered = False
         self._landing_seen = False
         self._climb_seen = False
@@ -171,7 +174,9 @@ class AuthorityLogic:
         before, self._seen = self._seen, seen
         if self._silence.look(seen.heard_s, now_s) > GAP_S:
             self._gap = (self._silence.silent_s, now_s)
-        if self._is_silent(seen):
+        was_silent, self._was_silent = self._was_silent, self._is_silent(seen)
+        self.silences += self.phase == "landed" and self._was_silent and not was_silent
+        if self._was_silent:
             return self._due("land", now_s) if self.phase == "landing" else "wait"
         self._flew = self._flew or not seen.on_ground
         if self._flew and seen.on_ground and not seen.armed and self.phase not in ("ready", "landed"):

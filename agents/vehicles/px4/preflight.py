@@ -40,15 +40,16 @@ class Item:
     """Why it is red; empty when it is green."""
 
 
-def checklist(readings: Readings, mission: Mission, drone: int, aim: Aim | None) -> list[Item]:
+def checklist(readings: Readings, mission: Mission, drone: int, aim: Aim | None, *, again: bool = False) -> list[Item]:
     """All items, in the order in which a person would look. ``aim``: where the gimbal is told to point, if there is
-    one. A vehicle found in the air is asked only for what flying it takes."""
+    one. ``again``: it has flown already, and may have come down elsewhere than at its start. A vehicle found in the air
+    is asked only for what flying it takes."""
     items = [_heard(readings)]
     items += [Item(name, fault) for name, fault in (readings.undone or {}).items()]
     items += _health(readings, mission)
     if readings.is_airborne:
         return items
-    items += [_on_ground(readings), _battery(readings, mission), *_place(readings, mission, drone)]
+    items += [_on_ground(readings), _battery(readings, mission), *_place(readings, mission, drone)[again:]]
     if aim is not None:
         items.append(_gimbal(readings, mission, aim))
     return items
@@ -102,6 +103,7 @@ def _battery(readings: Readings, mission: Mission) -> Item:
 
 
 def _place(readings: Readings, mission: Mission, drone: int) -> list[Item]:
+    """Horizontally, and the height."""
     if readings.position is None:
         return []
     x, y, z = readings.position.tolist()

@@ -73,16 +73,24 @@ class Preparation:
         if self._gimbal is not None:
             self._steps["gimbal control"] = self._gimbal.take
         self.undone = dict.fromkeys(self._steps, "not tried yet")
+        self._since_s = -math.inf
+        """What was heard before that is no longer true: -inf before the first flight."""
         slots.subscribe(system, self._telemetry, gimbal)
+
+    def start_over(self, now_s: float) -> None:
+        """All of it is undone, and unknown what was heard before ``now_s``: the vehicle may have booted since. A
+        `go_on` that runs meanwhile does nothing for that any more."""
+        self.undone, self.changes, self._since_s = dict.fromkeys(self._steps, "not tried yet"), [], now_s
 
     def go_on(self) -> None:
         """Do what is undone, in order; blocks."""
-        for name in list(self.undone):
+        undone = self.undone
+        for name in list(undone):
             try:
                 self._steps[name]()
-                del self.undone[name]
+                del undone[name]
             except VehicleError as error:
-                self.undone[name] = str(error)
+                undone[name] = str(error)
                 return
 
     def _ask_for_rates(self) -> None:
@@ -127,7 +135,8 @@ class Preparation:
 
     def readings(self, oldest_s: float) -> Readings:
         """``oldest_s``: what came before that is not known."""
-        slots = self._slots
+        slots, oldest_s = self._slots, max(oldest_s, self._since_s)
+        health = slots.health
 
         def fresh(sample: Sample[Value] | None) -> Value | None:
             return sample.value if sample is not None and sample.at_s >= oldest_s else None
@@ -142,13 +151,13 @@ class Preparation:
             landed=fresh(slots.landed),
             armed=fresh(slots.armed),
             battery=fresh(slots.battery),
-            health=slots.health.value if slots.health is not None else None,  # told when it changes
+            health=health.value if health is not None and health.at_s >= self._since_s else None,  # told seldom
             pointing=fresh(slots.pointing),
             undone=dict(self.undone),
         )
 
     def items(self, readings: Readings) -> list[Item]:
-        return checklist(readings, self._mission, self._drone, self._aim)
+        return checklist(readings, self._mission, self._drone, self._aim, again=math.isfinite(self._since_s))
 
     def result(self) -> Prepared:
         if self._frame is None:
@@ -157,21 +166,18 @@ class Preparation:
 
 
 async def prepare_vehicle(
-    system: System,
-    slots: TelemetrySlots,
-    mission: Mission,
-    drone: int,
+    preparation: Preparation,
     executor: Executor,
     now_s: Callable[[], float],
     events: Callable[[str, str], None],
+    on_red: Callable[[list[Item]], None],
 ) -> Prepared:
-    """Wait for up to ``vehicles.preflight_s`` for every item to become green.
+    """Wait for every item to become green. ``on_red``: called with those that are not, again and again; what it raises
+    ends the wait.
 
     Raises:
-        VehicleError: names each item that stayed red, with the reason.
+        VehicleError: the connection is gone.
     """
-    preparation = Preparation(system, slots, mission, drone)
-    deadline_s = now_s() + mission.vehicles.preflight_s
     while True:
         await asyncio.get_running_loop().run_in_executor(executor, preparation.go_on)
         readings = preparation.readings(now_s() - SLOW_S)
@@ -180,12 +186,24 @@ async def prepare_vehicle(
         faults = red(items)
         if not faults:
             break
-        if now_s() > deadline_s:
-            listed = "\n".join(f"  {item.name}: {item.fault}" for item in faults)
-            raise VehicleError(f"drone {drone} is not fit to fly:\n{listed}")
+        on_red(faults)
         await asyncio.sleep(POLL_S)
     for change in preparation.changes:
         events("info", f"parameter {change}")
     where = "in the air" if readings.is_airborne else "on the ground"
     events("info", f"preflight, {where}: {', '.join(item.name for item in items)}: all fine")
     return preparation.result()
+
+
+class UntilTooLate:
+    """Of the checks before the first take-off: whoever stays red for ``vehicles.preflight_s`` does not fly."""
+
+    def __init__(self, mission: Mission, drone: int, now_s: Callable[[], float]) -> None:
+        self._drone, self._now_s = drone, now_s
+        self._deadline_s = now_s() + mission.vehicles.preflight_s
+
+    def __call__(self, faults: list[Item]) -> None:
+        """Raises: VehicleError: names each item that stayed red, with the reason."""
+        if self._now_s() > self._deadline_s:
+            listed = "\n".join(f"  {item.name}: {item.fault}" for item in faults)
+            raise VehicleError(f"drone {self._drone} is not fit to fly:\n{listed}")

@@ -20,7 +20,8 @@ from agents.vehicles.px4.authority import FAILSAFES, AuthorityLogic, Observation
 from agents.vehicles.px4.connection import Connection
 from agents.vehicles.px4.gimbal import Aim, GimbalWatch
 from agents.vehicles.px4.pilot import Pilot
-from agents.vehicles.px4.preparation import Prepared, prepare_vehicle
+from agents.vehicles.px4.preparation import Preparation, Prepared, UntilTooLate, prepare_vehicle
+from agents.vehicles.px4.recheck import Recheck
 from agents.vehicles.px4.setpoint import AngleSetpoint, yaw_setpoint
 from agents.vehicles.px4.telemetry_slots import TelemetrySlots
 from agents.vehicles.vehicle import Condition, Telemetry
@@ -62,6 +63,11 @@ class Px4Vehicle:
         )
         self._connection: Connection | None = None
         self._prepared: Prepared | None = None
+        self._again: Recheck | None = None
+        self._silences = 0
+        """Of those on the ground, how many were noticed."""
+        self._stood: Telemetry | None = None
+        """The newest from before such a silence, until its place has been asked for anew."""
         self._loop: asyncio.AbstractEventLoop | None = None
         self._loop_thread = 0
         self._pilot: asyncio.Task[None] | None = None
@@ -81,9 +87,10 @@ class Px4Vehicle:
         self._loop, self._loop_thread = asyncio.get_running_loop(), threading.get_ident()
         try:
             system = await self._connect()
-            self._prepared = await prepare_vehicle(
-                system, self._slots, self._mission, self._drone, self._executor, self._now_s, self._events
-            )
+            preparation = Preparation(system, self._slots, self._mission, self._drone)
+            patience = UntilTooLate(self._mission, self._drone, self._now_s)
+            self._prepared = await prepare_vehicle(preparation, self._executor, self._now_s, self._events, patience)
+            self._again = Recheck(preparation, self._executor, self._now_s, self._events)
             self._begin(self._prepared)
         except BaseException:
             self.close()
@@ -102,24 +109,34 @@ class Px4Vehicle:
             self._start[2], self._settings.telemetry_lost_s, FAILSAFES.get(prepared.loss_action, "")
         )
         self._logic.observe(self.observe(), self._now_s())
+        self._start_from(prepared)
+        pilot = Pilot(self, self._logic, self._lock, self._executor, self._now_s, self._events)
+        self._pilot = asyncio.get_running_loop().create_task(pilot.run(), name=f"pilot of drone {self._drone}")
+
+    def _start_from(self, prepared: Prepared) -> None:
         if prepared.aim is not None:
             self._pitch.reset(prepared.aim.pitch_rad)
         self._take_measured_yaw()
-        pilot = Pilot(self, self._logic, self._lock, self._executor, self._now_s, self._events)
-        self._pilot = asyncio.get_running_loop().create_task(pilot.run(), name=f"pilot of drone {self._drone}")
 
     def take_off(self) -> None:
         with self._lock:
             self._logic.take_off(self._now_s())
 
     def make_ready(self) -> bool:
+        if self._again is None or self._again.is_running or self._logic.phase != "landed":
+            return False
+        if not self._again.is_fit:
+            self._again.begin()
+            return False
         with self._lock:
             return self._logic.make_ready(self._now_s())
 
     # What it says
 
     def condition(self) -> Condition:
-        """Raises: VehicleError: the pilot task failed."""
+        """Raises: VehicleError: the pilot task or a check failed."""
+        if self._again is not None and self._again.error is not None:
+            raise VehicleError(f"drone {self._drone}: it cannot be checked again: {self._again.error}")
         if self._pilot is not None and self._pilot.done() and not self._pilot.cancelled():
             error = self._pilot.exception()
             if error is not None:
@@ -129,6 +146,8 @@ class Px4Vehicle:
         return Condition(authority, reason, self._watch.lost, self._slots.jumps)
 
     def telemetry(self) -> Telemetry | None:
+        if self._stood is not None:
+            return self._stood
         motion, attitude, battery = self._slots.motion, self._slots.attitude, self._slots.battery
         if self._prepared is None or motion is None or attitude is None or battery is None:
             return None
@@ -269,6 +288,8 @@ class Px4Vehicle:
         self._prepared = None
         if self._pilot is not None:
             self._pilot.cancel()
+        if self._again is not None:
+            self._again.cancel()
         self._slots.unsubscribe()
         self._executor.shutdown(wait=True, cancel_futures=True)
         if self._connection is not None:
@@ -306,7 +327,8 @@ class Px4Vehicle:
                 self._put(self._prepared, STILL)
 
     def watch(self) -> None:
-        """Judge the gimbal."""
+        """Judge the gimbal, and what was silent on the ground."""
+        self._look_again()
         if self._settings.camera_mount == "fixed":
             return
         was = self._watch.lost
@@ -314,6 +336,20 @@ class Px4Vehicle:
         self._watch.judge(self._aim() if flies else None, self._slots.pointing, self._now_s())
         if self._watch.lost != was:
             self._events(*(("error", f"gimbal lost: {self._watch.reason}") if not was else ("info", "gimbal is back")))
+
+    def _look_again(self) -> None:
+        """What was without power has another local frame: nothing that it says of its place counts until then."""
+        if self._again is None:
+            return
+        if self._logic.silences > self._silences:
+            self._stood, self._silences = self.telemetry(), self._logic.silences
+            self._events("warning", "silent on the ground: is checked again when it is heard")
+            self._again.begin()
+        prepared = self._again.take()
+        if prepared is not None:
+            with self._lock:
+                self._prepared, self._stood = prepared, None
+                self._start_from(prepared)
 
     @property
     def _is_in_loop(self) -> bool:
