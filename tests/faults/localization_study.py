@@ -1,9 +1,10 @@
 """How well drones know where they are, by what tells them, and what that does to the map: docs/localization.md.
 
-    PYTHONPATH=.:tests .venv/bin/python -m faults.localization_study FOLDER [SECONDS]
+    PYTHONPATH=.:tests .venv/bin/python -m faults.localization_study FOLDER [sensors|missions]
 
-Flies along a given path with each sensor, then the same mission with each source of poses. What lies in FOLDER already
-is not flown again.
+Flies along a given path with each sensor, and the same mission with each source of poses (`localization_flights`), as
+``covrecon run`` does. What lies in FOLDER already is not flown again. Each table of the page is written anew by its
+part alone.
 """
 
 from __future__ import annotations
@@ -15,41 +16,27 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
 
 from agents.localization.pose_filter import PoseFilter, largest_deviation
 from agents.localization.registration import MAP_SD_M, MAP_SD_RAD, ScanRegistration
-from faults.located_team import located
+from faults.localization_flights import NOISE, fly_all
 from faults.measured_page import write_measured
-from faults.virtual_loop import run
-from ground_station.keyframe_log import NoKeyframes
-from ground_station.mapper import Mapper
-from protocol.field import VirtualField
 from protocol.geometry import Floats
-from protocol.localization_settings import EstimateNoise, Lidar, Localization
-from protocol.map_settings import Feedback
-from protocol.messages import Keyframe
-from protocol.mission import Drone, Mission, Simulation
-from protocol.operation_settings import Recording
+from protocol.localization_settings import Lidar
 from protocol.separation import SIGMAS
-from sim_bridge.camera import Camera
 from sim_bridge.estimate import EstimateError
-from sim_bridge.lidar import LidarSensor, directions, measure
-from sim_bridge.photographer import Photographer
+from sim_bridge.lidar import directions, measure
 from sim_bridge.scenes.cache import scene_cache
 from sim_bridge.scenes.lighting import ray_caster
-from sim_bridge.scenes.scene import Scene, load_scene
-from sim_bridge.scenes.truth import write_truth
+from sim_bridge.scenes.scene import load_scene
 
 Pattern = Callable[[np.random.Generator, Lidar], Floats]
 
 TICK_S = 0.05
 SCAN_TICKS = 2
 SCENE = "living_room"
-NOISE = EstimateNoise(drift_m=0.05, drift_rad=0.01, velocity_mps=0.03, white_m=0.005, white_rad=0.002)
-"""Of the vehicle: visual-inertial odometry or optical flow indoors. With KISS-ICP, of its velocity the same."""
 SECONDS = (60, 300)
 PAGE = Path("docs/localization.md")
 
@@ -161,64 +148,6 @@ def fly_path(pattern: Pattern | None, seconds: int, seed: int = 1) -> Track:
     )  # fmt: skip
 
 
-# --- missions --------------------------------------------------------------------------------------------------------
-
-SOURCES: Mapping[str, tuple[Literal["vehicle", "lidar"], bool]] = {
-    "perfect pose": ("vehicle", False),
-    "vehicle's estimate with noise": ("vehicle", True),
-    "KISS-ICP fused": ("lidar", True),
-}
-
-
-def mission_of(source: Literal["vehicle", "lidar"], *, noisy: bool, seconds: int) -> Mission:
-    return Mission(
-        duration_s=seconds,
-        simulation=Simulation(scene=SCENE, estimate=NOISE if noisy else EstimateNoise()),
-        localization=Localization(source=source),
-        feedback=Feedback(method="none"),
-        recording=Recording(enabled=False, report=False),
-        drones=(Drone(id=1, start=(0.0, 1.0, 2.0, 0.0, 1.3)),),
-    )
-
-
-def fly_mission(folder: Path, mission: Mission) -> dict[str, Any]:
-    """Figures of a flight of the real agent, simulator and ground station, in one process and virtual time, and of the
-    map that is made of its keyframes afterwards; in so short a flight nothing would have jumped yet."""
-    figures = folder / "figures.json"
-    if not figures.exists():
-        scene = load_scene(SCENE, relative_to=Path(), cache=scene_cache())
-        told = fly_and_map(folder, mission, Photographer(mission, Camera(scene, mission.camera.intrinsics())), scene)
-        figures.write_text(json.dumps(told))
-    content: dict[str, Any] = json.loads(figures.read_text())
-    return content
-
-
-def fly_and_map(folder: Path, mission: Mission, photographer: Photographer, scene: Scene) -> dict[str, Any]:
-    folder.mkdir(parents=True)
-    write_truth(scene, mission, folder, cache=scene_cache())
-
-    async def main() -> None:
-        async with located(mission, folder, seed=1) as team:
-            team.photographer = photographer
-            if mission.localization.source == "lidar":
-                team.sensor = LidarSensor(scene, mission.lidar, mission.seed)
-            await team.until_over()
-            if team.failed():
-                raise SystemExit("\n".join(team.failed()))
-            keyframes.extend(team.keyframes)
-
-    keyframes: list[Keyframe] = []
-    run(main())
-    mapper = Mapper(mission, VirtualField.of(mission.target), folder, NoKeyframes())
-    for keyframe in keyframes:
-        mapper.add([keyframe])
-    scores = mapper.finish().scores
-    assert scores is not None
-    told: dict[str, Any] = json.loads((folder / "summary.json").read_text())
-    told |= {"f_score_visible": scores.visible.f, "f_score_objects": scores.objects.f}
-    return told | {"keyframes": len(keyframes), "keyframes_unlocated": mapper.unlocated}
-
-
 # --- the page --------------------------------------------------------------------------------------------------------
 
 
@@ -229,7 +158,7 @@ def cm(metres: float | None) -> str:
 EXTREMES = "final / rms / max"
 
 
-def tables(folder: Path, mission_s: int) -> str:
+def sensors(folder: Path) -> str:
     lines = [
         f"| poses from | s | error {EXTREMES}, cm | yaw max, ° | told, cm | beyond 3 told | refused | CPU ms (p95) |",
         "|---|---|---|---|---|---|---|---|",
@@ -246,27 +175,23 @@ def tables(folder: Path, mission_s: int) -> str:
                 f" | {math.degrees(track.yaw_max_rad):.2f} | {cm(track.told_m)} | {track.beyond:.1%}"
                 f" | {track.refused} | {cost} |"
             )
-    lines += [
-        "",
-        f"| mission of {mission_s} s | F visible | F objects | keyframes | left out | error rms / max, cm |",
-        "|---|---|---|---|---|---|",
-    ]
-    for name, (source, noisy) in SOURCES.items():
-        place = folder / f"mission-{source}-{'noisy' if noisy else 'perfect'}-{mission_s}"
-        flown = fly_mission(place, mission_of(source, noisy=noisy, seconds=mission_s))
-        lines.append(
-            f"| {name} | {flown['f_score_visible']:.3f} | {flown['f_score_objects']:.3f} | {flown['keyframes']}"
-            f" | {flown['keyframes_unlocated']} | {cm(flown['pose_error_rms_m'])} / {cm(flown['pose_error_max_m'])} |"
-        )
     return "\n".join(lines)
 
 
+def missions(folder: Path) -> str:
+    return "\n".join(fly_all(folder, SECONDS[0]))
+
+
+PARTS: Mapping[str, Callable[[Path], str]] = {"sensors": sensors, "missions": missions}
+
+
 def main(arguments: list[str]) -> None:
-    folder = Path(arguments[0])
-    folder.mkdir(parents=True, exist_ok=True)
-    measured = tables(folder, int(arguments[1]) if len(arguments) > 1 else SECONDS[0])
-    write_measured(PAGE, measured)
-    print(measured)
+    folder, *asked = arguments
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    for part in asked or PARTS:
+        measured = PARTS[part](Path(folder))
+        write_measured(PAGE, measured, part)
+        print(measured)
 
 
 if __name__ == "__main__":

@@ -4,13 +4,20 @@ from __future__ import annotations
 
 from pathlib import Path
 
-BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
+MEASURED = "measured"
 
 
-def write_measured(page: Path, measured: str) -> None:
-    """Put ``measured`` in the place of what stands between the comments. Raises `ValueError` where they are not."""
-    before, begins, rest = page.read_text().partition(BEGIN)
-    _, ends, after = rest.partition(END)
+def comments(what: str = MEASURED) -> tuple[str, str]:
+    """Before and after it."""
+    return f"<!-- {what}: begin -->", f"<!-- {what}: end -->"
+
+
+def write_measured(page: Path, measured: str, what: str = MEASURED) -> None:
+    """Put ``measured`` in the place of what stands between the comments; ``what``: which, of a page with several.
+    Raises `ValueError` where they are not."""
+    begin, end = comments(what)
+    before, begins, rest = page.read_text().partition(begin)
+    _, ends, after = rest.partition(end)
     if not (begins and ends):
-        raise ValueError(f"{page}: lacks the lines {BEGIN} and {END}, between which the results come")
-    page.write_text(f"{before}{BEGIN}\n{measured}\n{END}{after}")
+        raise ValueError(f"{page}: lacks the lines {begin} and {end}, between which the results come")
+    page.write_text(f"{before}{begin}\n{measured}\n{end}{after}")

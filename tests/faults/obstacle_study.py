@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from faults.measured_page import write_measured
+from faults.run_flight import run_flight
 
 PAGE = Path("docs/obstacles.md")
 REACHED = 0.25
@@ -74,17 +74,7 @@ def fly(room: int, *, enabled: bool, seconds: float, folder: Path) -> Flight:
                 room=room,
             )
         )
-        command = [sys.executable, "-c", "from deploy.cli import main; main()", "run", str(mission), "--headless"]
-        ran = subprocess.run(
-            [*command, "--drones", str(DRONES), "--out", str(place)],
-            check=False,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        if ran.returncode:
-            raise SystemExit(f"{place}: the flight failed\n{ran.stdout[-3000:]}")
-        figures.write_text(json.dumps(_figures((place / "latest").resolve())))
+        figures.write_text(json.dumps(_figures(run_flight(mission, "--drones", str(DRONES)))))
     return Flight(**json.loads(figures.read_text()))
 
 

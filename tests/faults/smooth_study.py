@@ -19,9 +19,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
-from faults.localization_study import SCENE, fly_and_map
+from faults.located_team import located
 from faults.measured_page import write_measured
 from faults.team_flight import TeamFlight
+from faults.virtual_loop import run
+from ground_station.keyframe_log import NoKeyframes
+from ground_station.mapper import Mapper
+from protocol.field import VirtualField
 from protocol.geometry import Floats
 from protocol.map_settings import Feedback
 from protocol.messages import Keyframe
@@ -32,7 +36,9 @@ from sim_bridge.exposure import image_rate
 from sim_bridge.photographer import Photographer, Shot
 from sim_bridge.scenes.cache import scene_cache
 from sim_bridge.scenes.scene import Scene, load_scene
+from sim_bridge.scenes.truth import write_truth
 
+SCENE = "living_room"
 WEIGHTS = (0.0, 0.1)
 """Of `controller.smoothing`: before and after."""
 SEEDS = (1, 2, 3)
@@ -125,6 +131,31 @@ def edges(keyframe: Keyframe) -> float:
     """Mean square of what brightness changes by from pixel to pixel."""
     grey = np.asarray(Image.open(io.BytesIO(keyframe.jpeg)).convert("L"), float)
     return float((np.diff(grey, axis=0) ** 2).mean() + (np.diff(grey, axis=1) ** 2).mean())
+
+
+def fly_and_map(folder: Path, mission: Mission, photographer: Photographer, scene: Scene) -> dict[str, Any]:
+    """Figures of a flight in one process and virtual time, and of the map that is made of its keyframes afterwards."""
+    folder.mkdir(parents=True)
+    write_truth(scene, mission, folder, cache=scene_cache())
+
+    async def main() -> None:
+        async with located(mission, folder, seed=1) as team:
+            team.photographer = photographer
+            await team.until_over()
+            if team.failed():
+                raise SystemExit("\n".join(team.failed()))
+            keyframes.extend(team.keyframes)
+
+    keyframes: list[Keyframe] = []
+    run(main())
+    mapper = Mapper(mission, VirtualField.of(mission.target), folder, NoKeyframes())
+    for keyframe in keyframes:
+        mapper.add([keyframe])
+    scores = mapper.finish().scores
+    assert scores is not None
+    told: dict[str, Any] = json.loads((folder / "summary.json").read_text())
+    told |= {"f_score_visible": scores.visible.f, "f_score_objects": scores.objects.f}
+    return told | {"keyframes": len(keyframes)}
 
 
 def fly_with_cameras(folder: Path, weight: float, exposure_s: float) -> dict[str, Any]:
