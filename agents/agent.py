@@ -311,8 +311,10 @@ class Agent:
         return self._vehicle.condition()
 
     def _stands(self, telemetry: Telemetry) -> Telemetry:
-        """Of one that has landed; what it said last may be from before it stood still."""
-        return self._swap.as_it_stands(replace(telemetry, velocity=np.zeros(5)))
+        """Of one that has landed; what a silent one said last may be from before it stood still."""
+        if not self._is_fresh(telemetry):
+            telemetry = replace(telemetry, velocity=np.zeros(5))
+        return self._swap.as_it_stands(telemetry)
 
     def _way_up_is_free(self, telemetry: Telemetry | None, tick: int) -> bool:
         """At first all take off together, each at its place; later others may be about."""
@@ -406,10 +408,11 @@ class Agent:
     def _is_sound(self, telemetry: Telemetry, condition: Condition) -> bool:
         """Alive, fresh and valid, in simulation too. One that has landed stands where it was, though it be silent: its
         battery may be out."""
-        fresh = self._clock.now_s() - telemetry.stamp_s <= self._mission.vehicles.telemetry_stale_s
-        return (fresh or condition.authority == "landed") and bool(
-            np.isfinite(telemetry.pose).all() and np.isfinite(telemetry.velocity).all()
-        )
+        valid = bool(np.isfinite(telemetry.pose).all() and np.isfinite(telemetry.velocity).all())
+        return valid and (condition.authority == "landed" or self._is_fresh(telemetry))
+
+    def _is_fresh(self, telemetry: Telemetry) -> bool:
+        return self._clock.now_s() - telemetry.stamp_s <= self._mission.vehicles.telemetry_stale_s
 
     def _state_of(self, telemetry: Telemetry, tick: int, mode: Mode, blind_s: float) -> DroneState:
         return DroneState(

@@ -6,12 +6,15 @@ import asyncio
 import json
 import math
 import signal
+from collections import Counter
 from collections.abc import Collection
+from pathlib import Path
 from typing import Any, TypeAlias
 
 from faults.processes import END_S, Flight
 from faults.witness import true_positions
 from ground_station.journal import JOURNAL_FILE, Journal
+from ground_station.keyframe_log import KEYFRAMES_FILE, KeyframeLog
 from ground_station.results import SUMMARY_FILE
 from ground_station.separation import nearest_distances
 
@@ -99,3 +102,14 @@ def judge_journal(flight: Flight, figures: Figures, *, new_epoch: bool) -> list[
             if (replica.epoch, replica.next_jump) > (journal.epoch, journal.next_sequence):
                 violations.append(f"drone {drone} knows jump {replica.next_jump - 1} of epoch {replica.epoch}")
     return violations
+
+
+def kept_keyframes(folder: Path) -> int:
+    """In the log of a run's folder that the map is made of; each drone's without a gap."""
+    with KeyframeLog(folder / KEYFRAMES_FILE) as log:
+        kept = [keyframe for _, keyframe in log.read(0, log.end)]
+    numbers: dict[int, list[int]] = {}
+    for keyframe in kept:
+        numbers.setdefault(keyframe.drone, []).append(keyframe.sequence)
+    assert all(sorted(found) == list(range(len(found))) for found in numbers.values()), Counter(numbers)
+    return len(kept)

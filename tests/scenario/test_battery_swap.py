@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections import Counter
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -13,8 +12,8 @@ import pytest
 
 from deploy.mission_run import fly
 from deploy.plan_estimate import Plan, estimate
+from faults.judgement import kept_keyframes
 from faults.processes import write_scene
-from ground_station.keyframe_log import KEYFRAMES_FILE, KeyframeLog
 from ground_station.report.run_data import Run
 from ground_station.report.run_folder import load_run
 from protocol.messages import Status
@@ -125,17 +124,6 @@ def nearest_m(run: Run) -> float:
     assert np.isfinite(poses).all(), "everybody is told of at every tick"
     pairs = itertools.combinations(range(poses.shape[1]), 2)
     return float(min(np.linalg.norm(poses[:, one] - poses[:, other], axis=1).min() for one, other in pairs))
-
-
-def kept_keyframes(folder: Path) -> int:
-    """In the log that the map is made of; each drone's without a gap."""
-    with KeyframeLog(folder / KEYFRAMES_FILE) as log:
-        kept = [keyframe for _, keyframe in log.read(0, log.end)]
-    numbers: dict[int, list[int]] = {}
-    for keyframe in kept:
-        numbers.setdefault(keyframe.drone, []).append(keyframe.sequence)
-    assert all(sorted(found) == list(range(len(found))) for found in numbers.values()), Counter(numbers)
-    return len(kept)
 
 
 def takes_over(run: Run, plan: Plan) -> bool:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections import Counter
 from pathlib import Path
 
 import pytest
 
 from deploy.command_client import Place, command
+from faults.judgement import kept_keyframes
 from faults.px4_flight import HOME_M, PATIENCE_S, FlownDrone, Px4Flight, px4_flight, px4_mission
-from ground_station.keyframe_log import KEYFRAMES_FILE, KeyframeLog
 from protocol.mission import Mission
 from protocol.session import Link
 from sim_bridge.px4_endpoint.endpoint import Endpoint
@@ -100,14 +99,3 @@ async def it_stays(flight: Px4Flight, drone: FlownDrone) -> None:
     state = flight.processes.monitor.states[drone.id]
     assert abs(state.pose[0] - drone.position[0]) < HOME_M
     assert not drone.said("another battery is in")
-
-
-def kept_keyframes(folder: Path) -> int:
-    """In the log that the map is made of; each drone's without a gap."""
-    with KeyframeLog(folder / KEYFRAMES_FILE) as log:
-        kept = [keyframe for _, keyframe in log.read(0, log.end)]
-    numbers: dict[int, list[int]] = {}
-    for keyframe in kept:
-        numbers.setdefault(keyframe.drone, []).append(keyframe.sequence)
-    assert all(sorted(found) == list(range(len(found))) for found in numbers.values()), Counter(numbers)
-    return len(kept)

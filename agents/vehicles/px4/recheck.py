@@ -58,11 +58,9 @@ class Recheck:
     @property
     def error(self) -> BaseException | None:
         """Why it ended without a result."""
-        return (
-            self._task.exception()
-            if self._task is not None and self._task.done() and not self._task.cancelled()
-            else None
-        )
+        if self._task is None or not self._task.done() or self._task.cancelled():
+            return None
+        return self._task.exception()
 
     def take(self) -> Prepared | None:
         """What the vehicle is flown by from now on; once after each check."""
