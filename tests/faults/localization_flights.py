@@ -87,26 +87,32 @@ def fly(folder: Path, name: str, room: int, seconds: int) -> Flown:
 
 
 def fly_all(folder: Path, seconds: int) -> Iterator[str]:
-    """Every source in every room, then the table's lines."""
+    """Every source in every room; after each flight the table of what there is."""
     flown: dict[str, list[Flown]] = {name: [] for name in SOURCES}
     jobs = [(name, room) for room in ROOMS for name in SOURCES]
     for number, (name, room) in enumerate(jobs, start=1):
         flown[name].append(fly(folder, name, room, seconds))
         print(f"{number}/{len(jobs)} room-{room}, {name}: {flown[name][-1]}", file=sys.stderr, flush=True)
+        yield "\n".join(table(flown, seconds))
+
+
+def table(flown: Mapping[str, Sequence[Flown]], seconds: int) -> Iterator[str]:
+    """Markdown; by the name of the source, of each room in turn."""
     yield (
-        f"| {len(TEAM)} drones, {seconds} s, {len(ROOMS)} rooms | F visible: mean (each) | F objects: mean | keyframes"
-        " | left out | error rms / max, cm | beyond 3 told | least separation, m |"
+        f"| {len(TEAM)} drones, {seconds} s | rooms | F visible: mean (each) | F objects: mean | keyframes | left out"
+        " | error rms / max, cm | beyond 3 told | least separation, m |"
     )
-    yield "|---|---|---|---|---|---|---|---|"
+    yield "|---|---|---|---|---|---|---|---|---|"
     for name, flights in flown.items():
-        each = ", ".join(f"{flight.f_score_visible:.3f}" for flight in flights)
-        yield (
-            f"| {name} | {fmean(flight.f_score_visible for flight in flights):.3f} ({each})"
-            f" | {fmean(flight.f_score_objects for flight in flights):.3f}"
-            f" | {sum(flight.keyframes for flight in flights)}"
-            f" | {sum(flight.keyframes_unlocated for flight in flights)} | {_errors(flights)}"
-            f" | {min(flight.min_separation_m for flight in flights):.3f} |"
-        )
+        if flights:
+            each = ", ".join(f"{flight.f_score_visible:.3f}" for flight in flights)
+            yield (
+                f"| {name} | {len(flights)} | {fmean(flight.f_score_visible for flight in flights):.3f} ({each})"
+                f" | {fmean(flight.f_score_objects for flight in flights):.3f}"
+                f" | {sum(flight.keyframes for flight in flights)}"
+                f" | {sum(flight.keyframes_unlocated for flight in flights)} | {_errors(flights)}"
+                f" | {min(flight.min_separation_m for flight in flights):.2f} |"
+            )
 
 
 def _errors(flights: Sequence[Flown]) -> str:

@@ -13,7 +13,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -158,7 +158,7 @@ def cm(metres: float | None) -> str:
 EXTREMES = "final / rms / max"
 
 
-def sensors(folder: Path) -> str:
+def sensors(folder: Path) -> Iterator[str]:
     lines = [
         f"| poses from | s | error {EXTREMES}, cm | yaw max, ° | told, cm | beyond 3 told | refused | CPU ms (p95) |",
         "|---|---|---|---|---|---|---|---|",
@@ -175,23 +175,23 @@ def sensors(folder: Path) -> str:
                 f" | {math.degrees(track.yaw_max_rad):.2f} | {cm(track.told_m)} | {track.beyond:.1%}"
                 f" | {track.refused} | {cost} |"
             )
-    return "\n".join(lines)
+    yield "\n".join(lines)
 
 
-def missions(folder: Path) -> str:
-    return "\n".join(fly_all(folder, SECONDS[0]))
+def missions(folder: Path) -> Iterator[str]:
+    return fly_all(folder, SECONDS[0])
 
 
-PARTS: Mapping[str, Callable[[Path], str]] = {"sensors": sensors, "missions": missions}
+PARTS: Mapping[str, Callable[[Path], Iterator[str]]] = {"sensors": sensors, "missions": missions}
 
 
 def main(arguments: list[str]) -> None:
     folder, *asked = arguments
     Path(folder).mkdir(parents=True, exist_ok=True)
     for part in asked or PARTS:
-        measured = PARTS[part](Path(folder))
-        write_measured(PAGE, measured, part)
-        print(measured)
+        for measured in PARTS[part](Path(folder)):
+            write_measured(PAGE, measured, part)
+            print(measured)
 
 
 if __name__ == "__main__":
