@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import signal
 import socket
 import subprocess
@@ -137,37 +136,6 @@ OBSTACLES = """
 [flight.obstacles]
 enabled = true
 """
-
-
-LIDAR = """
-[localization]
-source = "lidar"
-[simulation.estimate]
-drift_m = 0.3
-drift_s = 2.0
-velocity_mps = 0.03
-white_m = 0.01
-"""
-
-
-def test_drones_located_by_lidar_fly_the_same_flight_twice(tmp_path: Path, mission: Write, fly: Fly) -> None:
-    """However long each agent's registrar takes."""
-    path = mission(duration=3.0, extra=LIDAR)
-    flights = []
-    for out in ("first", "second"):
-        code, output = finish(fly(path, "--speed", "max", out=out))
-        assert code == 0, output
-        folder = tmp_path / out / "latest"
-        for drone in (1, 3):
-            log = (folder / "logs" / f"drone-{drone}.log").read_text()
-            assert re.search(r"ScanCounts\(taken=(2[5-9]|30), refused=\d, missed=0\)", log), log
-        with np.load(folder / "trajectories.npz") as recorded:
-            flights.append((json.loads((folder / "summary.json").read_text()), dict(recorded)))
-    (summary, flown), (again, reflown) = flights
-    assert 0 < summary["pose_error_max_m"] < 0.1, "they would be lost without"
-    for key in ("phi_sha256", "mesh_sha256", "pose_error_rms_m", "pose_error_max_m"):
-        assert summary[key] == again[key], key
-    np.testing.assert_array_equal(flown["poses"], reflown["poses"])
 
 
 def test_drones_fly_by_the_map_of_free_cells_and_touch_nothing(tmp_path: Path, mission: Write, fly: Fly) -> None:
