@@ -74,7 +74,7 @@ class Obstacles:
         if due:
             self._waiting = deque((message for message in self._waiting if message.tick > tick), QUEUE)
             try:
-                self.free = self.grid.unpack(due[-1].packed) | self.grid.vouched
+                self.free = self.grid.read(due[-1])
             except MessageError:
                 self.refused += 1
         if deviation_m != self._deviation_m:

@@ -64,7 +64,7 @@ class ObstaclePublisher:
             free = await look.task
             self._looks.popleft()
             effective = look.effective if self._lockstep else tick
-            self._bus.put(topics.FREE, FreeCells(tick=effective, packed=self._grid.pack(free)))
+            self._bus.put(topics.FREE, FreeCells(tick=effective, packed=self._grid.pack(free), with_vouched=True))
             self._recorder.free(effective, self._grid, free)
 
     def close(self) -> None:

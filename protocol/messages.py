@@ -424,13 +424,16 @@ class MeshPage(Message):
 
 
 class FreeCells(Message):
-    """Which cells the map has seen free (`protocol.obstacle_grid`), all of them anew each time."""
+    """Which cells are free (`protocol.obstacle_grid`), all of them anew each time."""
 
     name: ClassVar[str] = "free_cells"
     tick: TickNumber
     """Takes effect at it."""
     packed: bytes
     """One bit a cell, x slowest, zlib."""
+    with_vouched: bool = False
+    """Whether they include what the mission vouches for, where the map does not know better. Else, from an earlier
+    release, who reads them adds that."""
 
 
 class KeyframePage(Message):

@@ -1,11 +1,12 @@
 """Which cells of the flight region are free of obstacles: their lattice, what the crew vouches for, how they travel.
 
-A cell is free or it is not; whether what is not free was seen or is only unknown makes no difference to a drone. The
-ground station says what was seen free. Everybody adds by itself what the mission vouches for:
+A cell is free or it is not; whether what is not free was seen or is only unknown makes no difference to a drone. Free
+is what was seen free, and what the mission vouches for:
 
 * all above ``flight.obstacles.clear_above_m``; the lattice ends there;
-* the room around each drone's start, and straight up from there: the crew chose it, and a return ends in it. Below it
-  too for vehicles that took off from the ground.
+* the room around each drone's start, and straight up from there: the crew chose it, and a return ends in it. A map that
+  sees something there is believed, for it is nearer than the crew thought;
+* below it too for vehicles that took off from the ground, whatever a map sees: they stood there.
 
 The lattice reaches to the sides of the flight box, and below it as far as a drone must look. Beyond, nothing is judged.
 """
@@ -25,6 +26,7 @@ from protocol.geometry import Floats
 from protocol.separation import position_error, top_speed, widened
 
 if TYPE_CHECKING:
+    from protocol.messages import FreeCells
     from protocol.mission import Flight, Mission
 
 Cells = NDArray[np.bool_]
@@ -62,7 +64,9 @@ class ObstacleGrid:
     cell_m: float
     shape: tuple[int, int, int]
     vouched: Cells
-    """[x, y, z] what the mission vouches for."""
+    """[x, y, z] what the mission vouches for ..."""
+    stood_on: Cells
+    """... and what of it no map is believed against."""
 
     @classmethod
     def of(cls, mission: Mission) -> ObstacleGrid:
@@ -73,7 +77,7 @@ class ObstacleGrid:
         anchor = np.array(mission.target.lower_m)
         origin = anchor + cell * np.floor((low - anchor) / cell + _ROUNDING)
         x, y, z = np.maximum(np.ceil((high - origin) / cell - _ROUNDING), 1).astype(int).tolist()
-        empty = cls(origin, cell, (x, y, z), np.zeros((x, y, z), np.bool_))
+        empty = cls(origin, cell, (x, y, z), np.zeros((x, y, z), np.bool_), np.zeros((x, y, z), np.bool_))
         empty._vouch(mission)
         return empty
 
@@ -83,9 +87,11 @@ class ObstacleGrid:
         for drone in mission.drones:
             aside = np.hypot(*(columns - np.array(drone.start[:2])).T).reshape(*self.shape[:2], 1)
             below = np.maximum(drone.start[2] - heights, 0.0)
+            around = np.hypot(aside, below) <= radius
+            self.vouched[around] = True
             if mission.vehicles.kind != "simulated":
-                below[:] = 0.0
-            self.vouched[np.hypot(aside, below) <= radius] = True
+                self.stood_on[(aside <= radius) & ~around] = True
+        self.vouched[self.stood_on] = True
 
     def _centres(self) -> tuple[Floats, Floats]:
         """Of columns (x * y, 2), and heights (z,)."""
@@ -96,6 +102,11 @@ class ObstacleGrid:
 
     def pack(self, free: Cells) -> bytes:
         return zlib.compress(np.packbits(free).tobytes(), 6)
+
+    def read(self, message: FreeCells) -> Cells:
+        """[x, y, z] free cells. Raises `MessageError` for what is not this lattice's."""
+        free = self.unpack(message.packed)
+        return free if message.with_vouched else free | self.vouched
 
     def unpack(self, packed: bytes) -> Cells:
         """Raises `MessageError` for what is not this lattice's."""

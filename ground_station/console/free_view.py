@@ -51,7 +51,7 @@ class FreeView:
         if message is None or message is self._message:
             return False
         self._message = message
-        free = self.grid.unpack(message.packed) | self.grid.vouched
+        free = self.grid.read(message)
         changed = not np.array_equal(free, self._free)
         self._free = free
         return changed

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ground_station.reconstruction.depth_check import COMPARED_MIN, NEAREST_M, Measured, fault_of
 from ground_station.reconstruction.depth_range import depth_range
-from ground_station.reconstruction.free_cells import seen_free
+from ground_station.reconstruction.free_cells import free_cells
 from ground_station.reconstruction.fusion import Volume
 from ground_station.reconstruction.ledger import Ledger
 from ground_station.reconstruction.reconstructor import PATIENCE_S, Keyframe, Mesh, Outcome, State, Statistics
@@ -78,7 +78,7 @@ class DepthReconstructor:
         return extract_mesh(self._volume, WEIGHT_MIN)
 
     def free_cells(self, grid: ObstacleGrid) -> Cells:
-        return seen_free(self._volume, WEIGHT_MIN, grid)
+        return free_cells(self._volume, WEIGHT_MIN, grid)
 
     def statistics(self) -> Statistics:
         kept = sum(BYTES_PER_PIXEL * entry.measured.depth.size for entry in self._kept if entry)

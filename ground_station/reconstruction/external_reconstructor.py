@@ -50,8 +50,8 @@ class ExternalReconstructor:
         return Mesh(mesh.vertices.copy(), mesh.faces.copy(), mesh.colors.copy())
 
     def free_cells(self, grid: ObstacleGrid) -> Cells:
-        """None: a mesh does not say what was seen free."""
-        return np.zeros(grid.shape, np.bool_)
+        """What is vouched for: a mesh does not say what was seen free."""
+        return grid.vouched.copy()
 
     def statistics(self) -> Statistics:
         mesh, _ = self._process.newest

@@ -20,7 +20,7 @@ from ground_station.reconstruction.admission import Admission
 from ground_station.reconstruction.consistency import agreements
 from ground_station.reconstruction.depth_map import DepthMap, make_estimator
 from ground_station.reconstruction.depth_range import DepthRange
-from ground_station.reconstruction.free_cells import seen_free
+from ground_station.reconstruction.free_cells import free_cells
 from ground_station.reconstruction.fusion import Volume
 from ground_station.reconstruction.ledger import Ledger
 from ground_station.reconstruction.pose_refiner import Pose, PoseRefiner
@@ -111,7 +111,7 @@ class PlaneSweepReconstructor:
 
     def free_cells(self, grid: ObstacleGrid) -> Cells:
         self._fuse_due()
-        return seen_free(self._volume, WEIGHT_MIN, grid)
+        return free_cells(self._volume, WEIGHT_MIN, grid)
 
     def statistics(self) -> Statistics:
         kept = len(self._index) * self._width * self._height * BYTES_PER_PIXEL

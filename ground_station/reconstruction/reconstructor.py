@@ -136,8 +136,9 @@ class Reconstructor(Protocol):
         ...
 
     def free_cells(self, grid: ObstacleGrid) -> Cells:
-        """[x, y, z] cells of ``grid`` that were seen free, by what is decided by now; none where a method cannot tell
-        free from unknown. The array is the caller's."""
+        """[x, y, z] cells of ``grid`` that drones may fly in, by what is decided by now: those that were seen free, and
+        those that the mission vouches for and in which nothing was seen. These alone where a method cannot tell free
+        from unknown. The array is the caller's."""
         ...
 
     def statistics(self) -> Statistics: ...
@@ -178,7 +179,7 @@ class NullReconstructor:
         return Mesh.empty()
 
     def free_cells(self, grid: ObstacleGrid) -> Cells:
-        return np.zeros(grid.shape, np.bool_)
+        return grid.vouched.copy()
 
     def statistics(self) -> Statistics:
         return Statistics(self._received, self._received, 0, {}, 0)

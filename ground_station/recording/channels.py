@@ -196,8 +196,8 @@ class Channels:
             case "mesh":
                 self._show(MESH, shapes.scene(content, time_ns), time_ns)
             case "free":
-                grid, seen = content
-                self._show(FREE, shapes.free_surface(grid, seen, time_ns), time_ns)
+                grid, free = content
+                self._show(FREE, shapes.free_surface(grid, free, time_ns), time_ns)
             case "metrics":
                 self._log(METRICS, to_json(asdict(content), inf_nan_mode="null"), time_ns)
             case "summary":

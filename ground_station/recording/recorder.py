@@ -175,10 +175,10 @@ class Recorder:
         if self._is_due("phi", tick):
             self._offer("phi", phi.mean(axis=1, dtype=np.float32), tick)
 
-    def free(self, tick: int, grid: ObstacleGrid, seen: Cells) -> None:
-        """What the map has seen free of ``grid``; recorded as often as the map. It must not change later."""
+    def free(self, tick: int, grid: ObstacleGrid, free: Cells) -> None:
+        """What of ``grid`` is free; recorded as often as the map. It must not change later."""
         if self._is_due("free", tick):
-            self._offer("free", (grid, seen), tick)
+            self._offer("free", (grid, free), tick)
 
     def metrics(self, metrics: Metrics) -> None:
         self._offer("metrics", metrics, metrics.tick)

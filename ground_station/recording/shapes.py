@@ -154,10 +154,9 @@ def cloud(positions: Floats, importance: NDArray[np.float32], time_ns: int) -> P
     )
 
 
-def free_surface(grid: ObstacleGrid, seen: Cells, time_ns: int) -> PointCloud:
-    """Where free space ends: the middles of cells that are not free beside one that is, ``seen`` so or vouched for.
-    Above the lattice all is free; what lies beside and below it is not judged."""
-    free = seen | grid.vouched
+def free_surface(grid: ObstacleGrid, free: Cells, time_ns: int) -> PointCloud:
+    """Where free space ends: the middles of cells that are not free beside one that is. Above the lattice all is free;
+    what lies beside and below it is not judged."""
     padded = np.pad(free, 1)
     padded[:, :, -1] = True
     beside = binary_dilation(padded)[1:-1, 1:-1, 1:-1]

@@ -67,7 +67,7 @@ def seen_free(mission: Mission, run: Path) -> tuple[ObstacleGrid, Cells, int]:
     reconstructor = make_reconstructor(mission)
     reconstructor.restore(checkpoint.map.reconstruction, ())
     grid = ObstacleGrid.of(mission)
-    return grid, reconstructor.free_cells(grid) | grid.vouched, checkpoint.tick
+    return grid, reconstructor.free_cells(grid), checkpoint.tick
 
 
 def touches(mission: Mission, triangles: NDArray[np.float32], paths: Floats) -> Floats:

@@ -5,6 +5,8 @@
 Flies ``room-1`` to ``room-N`` with four drones, with the rows and without, each as ``covrecon run`` flies it: in
 lockstep, with real processes and a map of images. A flight ends when J is below `REACHED` or after S seconds. What lies
 in FOLDER already is not flown again, so a study goes on where it was broken off; the table holds what there is.
+
+Drones start where the formation places them, or higher where that is nearer to furniture than they keep: a crew looks.
 """
 
 from __future__ import annotations
@@ -17,7 +19,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from faults.measured_page import write_measured
+from protocol.formation import Start, formation
+from protocol.mission import Flight as Region
+from protocol.triangles import squared_distance
+from sim_bridge.scenes.cache import scene_cache
+from sim_bridge.scenes.scene import load_scene
 from faults.run_flight import run_flight
 
 PAGE = Path("docs/obstacles.md")
@@ -41,7 +50,15 @@ scene = "room-{room}"
 [recording]
 enabled = false
 report = false
+{drones}
 """
+START = """
+[[drones]]
+id = {id}
+start = {start}
+"""
+ABOVE_ALL_M = 2.5
+"""Height of a start in a room where the formation's own is too near to something."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,10 +89,20 @@ def fly(room: int, *, enabled: bool, seconds: float, folder: Path) -> Flight:
                 walls=WALLS_M,
                 enabled=str(enabled).lower(),
                 room=room,
+                drones="".join(START.format(id=k, start=list(start)) for k, start in enumerate(starts(room), start=1)),
             )
         )
         figures.write_text(json.dumps(_figures(run_flight(mission, "--drones", str(DRONES)))))
     return Flight(**json.loads(figures.read_text()))
+
+
+def starts(room: int) -> Iterator[Start]:
+    """Of the four drones."""
+    triangles = load_scene(f"room-{room}", relative_to=Path(), cache=scene_cache()).triangles
+    region = Region(separation_m=SEPARATION_M)
+    for start in formation(region, DRONES):
+        nearest = min(squared_distance(np.array(start[:3], np.float32), corners) for corners in triangles)
+        yield start if nearest >= region.clearance_m**2 else (*start[:2], ABOVE_ALL_M, *start[3:])
 
 
 def _figures(run: Path) -> dict[str, Any]:

@@ -55,7 +55,7 @@ class ScriptedMapper:
 
     def free_cells(self, grid: ObstacleGrid) -> Cells:
         """A script sees nothing."""
-        return np.zeros(grid.shape, np.bool_)
+        return grid.vouched.copy()
 
     def state(self) -> MapState:
         return MapState({"updates": np.array([self._updates], np.int32)}, first=0, end=0, unreadable=0)

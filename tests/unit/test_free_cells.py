@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from faults.seen_room import room_mission
-from ground_station.reconstruction.free_cells import seen_free
+from ground_station.reconstruction.free_cells import free_cells
 from ground_station.reconstruction.fusion import Volume
 from ground_station.reconstruction.views import View
 from protocol.geometry import Floats, Intrinsics, camera_rotation
@@ -16,6 +16,7 @@ from protocol.obstacle_grid import Cells, ObstacleGrid
 
 MISSION = room_mission()
 GRID = ObstacleGrid.of(MISSION)
+GRID.vouched[:] = False
 WEIGHT_MIN = 0.3
 EMPTY = Volume(MISSION.target, 0.025, 0.05)
 CAMERA = Intrinsics.from_field_of_view(96, 54, 1.28)
@@ -43,11 +44,11 @@ def centres_of(cells: Cells) -> Floats:
 
 
 def test_nothing_is_free_that_was_never_seen() -> None:
-    assert not seen_free(EMPTY, WEIGHT_MIN, GRID).any()
+    assert not free_cells(EMPTY, WEIGHT_MIN, GRID).any()
 
 
 def test_what_was_seen_through_is_free_down_to_the_floor() -> None:
-    free = centres_of(seen_free(look_down(), WEIGHT_MIN, GRID))
+    free = centres_of(free_cells(look_down(), WEIGHT_MIN, GRID))
 
     assert len(free) > 1000
     assert free[:, 2].min() == pytest.approx(0.15), "the cell on the floor holds the surface"
@@ -58,7 +59,7 @@ def test_what_was_seen_through_is_free_down_to_the_floor() -> None:
 
 def test_what_is_behind_a_surface_or_at_it_is_not_free() -> None:
     volume = look_down(table_m=0.65)
-    free = centres_of(seen_free(volume, WEIGHT_MIN, GRID))
+    free = centres_of(free_cells(volume, WEIGHT_MIN, GRID))
 
     above_table = free[free[:, 1] > 0.05]
     assert above_table[:, 2].min() == pytest.approx(0.75, abs=0.051)
@@ -68,18 +69,18 @@ def test_what_is_behind_a_surface_or_at_it_is_not_free() -> None:
 def test_one_look_that_weighs_too_little_frees_nothing() -> None:
     volume = look_down()
     volume.weight *= np.float32(0.1)
-    assert not seen_free(volume, WEIGHT_MIN, GRID).any()
+    assert not free_cells(volume, WEIGHT_MIN, GRID).any()
 
 
 def test_a_single_voxel_at_a_surface_keeps_its_cell() -> None:
     volume = look_down()
-    before = seen_free(volume, WEIGHT_MIN, GRID)
+    before = free_cells(volume, WEIGHT_MIN, GRID)
     cell = np.argwhere(before)[len(np.argwhere(before)) // 2]
     middle = GRID.origin + GRID.cell_m * (cell + 0.5)
     voxel = np.rint((middle - volume.origin) / volume.voxel).astype(int)
     volume.distance[tuple(voxel)] = 0.01
 
-    after = seen_free(volume, WEIGHT_MIN, GRID)
+    after = free_cells(volume, WEIGHT_MIN, GRID)
 
     assert np.argwhere(before & ~after).tolist() == [cell.tolist()]
 
@@ -87,7 +88,36 @@ def test_a_single_voxel_at_a_surface_keeps_its_cell() -> None:
 def test_cells_of_another_size_than_voxels_divide_are_seen_as_well() -> None:
     flight = MISSION.flight.model_dump() | {"obstacles": {"enabled": True, "cell_m": 0.13}}
     grid = ObstacleGrid.of(room_mission(flight=flight))
-    free = seen_free(look_down(), WEIGHT_MIN, grid)
+    grid.vouched[:] = False
+    free = free_cells(look_down(), WEIGHT_MIN, grid)
     low = grid.origin + grid.cell_m * np.argwhere(free)
     assert len(low) > 300
     assert low[:, 2].min() > 0.02
+
+
+def test_what_the_mission_vouches_for_is_free_until_something_is_seen_in_it() -> None:
+    over_table, unseen = (0.3, 0.6, 1.0), (-1.4, -1.4, 1.0)
+    grid = ObstacleGrid.of(room_mission([over_table, unseen]))
+    assert np.array_equal(free_cells(EMPTY, WEIGHT_MIN, grid), grid.vouched)
+
+    free = free_cells(look_down(table_m=0.65), WEIGHT_MIN, grid)
+
+    taken = centres_of(grid.vouched & ~free)
+    assert len(taken) > 20, "the table is nearer than the crew thought"
+    assert (np.hypot(*(taken[:, :2] - over_table[:2]).T) < 0.5).all()
+    assert taken[:, 2].max() < 0.65 + GRID.cell_m
+    around_unseen = grid.vouched[: grid.shape[0] // 2]
+    assert around_unseen.any()
+    assert free[: grid.shape[0] // 2][around_unseen].all(), "and nobody knows better there"
+
+
+def test_where_a_vehicle_took_off_from_the_ground_it_may_land_whatever_is_seen() -> None:
+    mission = room_mission([(0.5, 0.5, 1.5)], vehicles={"kind": "px4"})
+    grid = ObstacleGrid.of(mission)
+    volume = look_down(table_m=0.65)
+
+    free = free_cells(volume, WEIGHT_MIN, grid)
+
+    assert grid.stood_on.any()
+    assert not (grid.stood_on & ~grid.vouched).any()
+    assert free[grid.stood_on].all()

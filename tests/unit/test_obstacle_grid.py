@@ -11,6 +11,7 @@ from pydantic import ValidationError
 from faults.seen_room import room_mission, rough_map
 from protocol.errors import MessageError
 from protocol.mission import Mission
+from protocol.messages import FreeCells
 from protocol.obstacle_grid import ObstacleGrid, kept_distance
 
 
@@ -50,6 +51,15 @@ def test_cells_arrive_as_they_were_sent(seed: int) -> None:
     grid = ObstacleGrid.of(room_mission())
     free = rough_map(grid, seed)
     assert np.array_equal(grid.unpack(grid.pack(free)), free)
+
+
+def test_a_map_of_an_earlier_release_is_completed_with_what_the_mission_vouches_for() -> None:
+    grid = ObstacleGrid.of(room_mission())
+    free = rough_map(grid, 1)
+    free[grid.vouched] = False
+    packed = grid.pack(free)
+    assert np.array_equal(grid.read(FreeCells(tick=0, packed=packed)), free | grid.vouched)
+    assert np.array_equal(grid.read(FreeCells(tick=0, packed=packed, with_vouched=True)), free)
 
 
 def test_what_is_not_a_map_of_this_lattice_is_refused() -> None:

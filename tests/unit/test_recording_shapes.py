@@ -74,11 +74,9 @@ def test_points_are_coloured_by_their_importance() -> None:
 
 
 def test_free_space_ends_where_a_cell_that_is_free_meets_one_that_is_not() -> None:
-    grid = ObstacleGrid(np.array([1.0, -2.0, 0.5]), 0.25, (5, 4, 3), np.zeros((5, 4, 3), np.bool_))
-    seen = np.zeros(grid.shape, np.bool_)
-    seen[2, 1:, 0] = True
-    grid.vouched[2, 2, 1] = True
-    free = seen | grid.vouched
+    grid = ObstacleGrid(np.array([1.0, -2.0, 0.5]), 0.25, (5, 4, 3), *np.zeros((2, 5, 4, 3), np.bool_))
+    free = np.zeros(grid.shape, np.bool_)
+    free[2, 1:, 0] = free[2, 2, 1] = True
     wanted = set()
     for index in product(*map(range, grid.shape)):
         for axis, step in product(range(3), (-1, 1)):
@@ -88,7 +86,7 @@ def test_free_space_ends_where_a_cell_that_is_free_meets_one_that_is_not() -> No
             inside = all(0 <= at < count for at, count in zip(other, grid.shape, strict=True))
             if not free[index] and (above or (inside and free[tuple(other)])):
                 wanted.add(tuple((grid.origin + grid.cell_m * (np.array(index) + 0.5)).tolist()))
-    cloud = decoded(shapes.free_surface(grid, seen, 0))
+    cloud = decoded(shapes.free_surface(grid, free, 0))
     assert [(field.name, field.offset) for field in cloud.fields] == [("x", 0), ("y", 4), ("z", 8)]  # type: ignore[attr-defined]
     places = np.frombuffer(cloud.data, "<f4").reshape(-1, cloud.point_stride // 4)  # type: ignore[attr-defined]
     assert len(places) == len(wanted)

@@ -94,8 +94,8 @@ class LearnedReconstructor:
         return extract_mesh(self._volume, WEIGHT_MIN)
 
     def free_cells(self, grid: ObstacleGrid) -> Cells:
-        """None: what a network takes for empty is a guess, and no drone shall fly into a guess."""
-        return np.zeros(grid.shape, np.bool_)
+        """What is vouched for: what a network takes for empty is a guess, and no drone shall fly into a guess."""
+        return grid.vouched.copy()
 
     def statistics(self) -> Statistics:
         return self._ledger.statistics(
