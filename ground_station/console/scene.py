@@ -227,8 +227,7 @@ class Scene:
         cell = _edges(nearest.low, nearest.low + view.grid.cell_m)
         line = np.array([[place, nearest.point]], np.float32)
         self._draw_lines("/free/nearest", np.concatenate([cell, line]))
-        middle = line[0].mean(axis=0)
-        self._scene.add_label("/free/distance", f"{nearest.distance_m:.2f} m", position=middle)
+        self._scene.add_label("/free/distance", f"{nearest.distance_m:.2f} m", position=nearest.point)
 
     def _draw_lines(self, name: str, segments: NDArray[np.float32]) -> None:
         if len(segments):

@@ -36,9 +36,9 @@ from sim_bridge.scenes.scene import load_scene
 
 PICTURE = Path("docs/images/obstacles.png")
 INCHES, DPI = (11.0, 5.9), 110
-COLOURS = 64
+COLOURS = 256
 HEIGHT_M = 1.0
-NEAR_M = 0.3
+NEAR_M = 0.4
 """From the cut: a path so near to it is drawn thick, because it goes around what is drawn, or into it."""
 FREE, NOT_FREE, FURNITURE, INK = "#ffffff", "#f6d5d0", "#5b4a42", "#1f2933"
 CONTACT = "#c62828"
