@@ -162,7 +162,7 @@ def keyframe_rate_hz(mission: Mission, speed_mps: float | None = None) -> float:
 def _told(mission: Mission, drone: int, plan: Plan) -> Iterator[tuple[Topic[Any], Direction, float, Message, int]]:
     """Topic, direction, rate, message, and bytes of its key that are spelt out."""
     rate_hz = mission.controller.rate_hz
-    yield topics.STATE, "up", rate_hz, traffic_samples.state(drone), 0
+    yield topics.STATE, "up", rate_hz, traffic_samples.state(drone, obstacles=mission.flight.obstacles.enabled), 0
     if mission.vehicles.kind == "simulated":
         yield topics.SETPOINT, "up", rate_hz, traffic_samples.setpoint(drone), 0
     jpeg_bytes = plan.jpeg_bytes
@@ -179,7 +179,7 @@ def _told(mission: Mission, drone: int, plan: Plan) -> Iterator[tuple[Topic[Any]
     else:
         for other in mission.drones:
             if other.id != drone:
-                message = traffic_samples.state(other.id)
+                message = traffic_samples.state(other.id, obstacles=mission.flight.obstacles.enabled)
                 yield topics.STATE, "down", rate_hz, message, _spelt_bytes(topics.STATE, other.id)
     if mission.localization.source == "lidar":
         yield topics.SCAN, "down", rate_hz / mission.scan_ticks, traffic_samples.scan(mission, drone), 0

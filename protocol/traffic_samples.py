@@ -43,8 +43,8 @@ def pose(drone: int, tick: int) -> Vector5:
     return (2 * math.cos(angle), 2 * math.sin(angle), 1.5 + 0.3 * math.sin(angle), angle % math.pi, 1.3)
 
 
-def state(drone: int) -> DroneState:
-    """With a decision that two barriers shaped, which is what most are."""
+def state(drone: int, *, obstacles: bool = False) -> DroneState:
+    """With a decision that two barriers shaped, which is what most are; ``obstacles``: of a mission with them."""
     control = Control(
         tick=TICK - 1,
         outcome="solved",
@@ -59,8 +59,9 @@ def state(drone: int) -> DroneState:
         fallbacks=12,
         refused=0,
         telemetry_age_s=0.0123,
-        obstacle_margin_m=0.456,
     )
+    if obstacles:
+        control = control.model_copy(update={"obstacle_margin_m": 0.456})
     return DroneState(
         drone=drone,
         tick=TICK,

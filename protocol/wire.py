@@ -5,7 +5,8 @@ wrong type, a wrong length, a number that is not finite - is refused with `Messa
 does a length that the bytes only claim cost memory or time before it is refused.
 
 Processes of different minor versions understand each other: a newer one may add fields, which an older one passes over
-and for which a newer one that does not find them takes their defaults.
+and for which a newer one that does not find them takes their defaults. So what lies within a message is sent without
+the fields that were not set.
 """
 
 from __future__ import annotations
@@ -108,8 +109,8 @@ def encode(message: Message) -> bytes:
 def _plain(value: object) -> object:
     if isinstance(value, np.ndarray):
         return _array_to_wire(value)
-    if isinstance(value, BaseModel):
-        return value.__dict__
+    if isinstance(value, BaseModel):  # what nobody set is its default to the reader too
+        return {name: field for name, field in value.__dict__.items() if name in value.model_fields_set}
     raise TypeError(f"{type(value).__name__} has no wire format")
 
 

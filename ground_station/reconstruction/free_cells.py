@@ -2,7 +2,8 @@
 
 A cell is free when every voxel in it and on its faces was seen often enough to be part of the map, and seen through:
 farther in front of any surface than half the truncation. What is at a surface, behind one, never seen or outside of the
-mapped box is not. Of the cells that the mission vouches for, those are in which no voxel was seen at or behind a surface.
+mapped box is not. Of the cells that the mission vouches for, those are free in which no voxel was seen at or behind a
+surface.
 """
 
 from __future__ import annotations

@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 
 from faults.measured_page import write_measured
+from faults.run_flight import run_flight
 from protocol.formation import Start, formation
 from protocol.mission import Flight as Region
 from protocol.triangles import squared_distance
 from sim_bridge.scenes.cache import scene_cache
 from sim_bridge.scenes.scene import load_scene
-from faults.run_flight import run_flight
 
 PAGE = Path("docs/obstacles.md")
 REACHED = 0.25

@@ -10,8 +10,8 @@ from pydantic import ValidationError
 
 from faults.seen_room import room_mission, rough_map
 from protocol.errors import MessageError
-from protocol.mission import Mission
 from protocol.messages import FreeCells
+from protocol.mission import Mission
 from protocol.obstacle_grid import ObstacleGrid, kept_distance
 
 
