@@ -73,7 +73,7 @@ async def it_comes_down(drone: FlownDrone) -> None:
     await drone.until_said(r"on the ground at \d+%: waits for another battery")
     assert drone.is_down
     assert drone.home_m < HOME_M
-    assert drone.mode == "starting", "not landed for good"
+    await drone.until(lambda: drone.mode == "starting", "to say that it is not landed for good")
 
 
 async def it_flies_on(flight: Px4Flight, drone: FlownDrone, *, boots: int) -> None:
@@ -96,6 +96,6 @@ async def it_stays(flight: Px4Flight, drone: FlownDrone) -> None:
     await it_comes_down(drone)
     await drone.until_said(r"its estimate moved by 2\.\d m on the ground: stays there")
     await resume(flight, drone)
-    state = flight.processes.monitor.states[drone.id]
-    assert abs(state.pose[0] - drone.position[0]) < HOME_M
+    states = flight.processes.monitor.states
+    await drone.until(lambda: abs(states[drone.id].pose[0] - drone.position[0]) < HOME_M, "to stand where it stands")
     assert not drone.said("another battery is in")
