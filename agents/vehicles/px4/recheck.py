@@ -48,12 +48,13 @@ class Recheck:
 
     @property
     def is_running(self) -> bool:
-        return self._task is not None and not self._task.done()
+        """Or its result waits to be taken."""
+        return self._result is not None or (self._task is not None and not self._task.done())
 
     @property
     def is_fit(self) -> bool:
-        """Whether all was green a moment ago, and `take` was called since."""
-        return self._result is None and self._now_s() - self._fit_s <= FRESH_S
+        """Whether all was green a moment ago."""
+        return self._now_s() - self._fit_s <= FRESH_S
 
     @property
     def error(self) -> BaseException | None:
