@@ -125,7 +125,16 @@ class Agent:
         self._news = News(bus, topics.EVENT, f"drone/{drone}", drone)
         self._hearing = Hearing(mission, drone, bus, self._replication, self._team, self._news.tell, lockstep=lockstep)
         self._vehicle = make_vehicle(mission, drone, bus, now_s=self._clock.now_s, events=self._note_event)
-        self._poses = make_pose_source(mission, drone, bus, lockstep=lockstep)
+        self._poses = make_pose_source(
+            mission,
+            drone,
+            bus,
+            lockstep=lockstep,
+            now_s=self._clock.now_s,
+            aid=self._vehicle.aid,
+            others=self._team.places,
+            tell=self._news.tell,
+        )
         self._orders = Orders(mission, self._clock.now_s, self._news.tell)
         self._operator = DroneOrder(drone=drone, action="fly", number=0)
         self._reserve = Reserve(mission, drone, self._obstacles)

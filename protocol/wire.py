@@ -25,7 +25,7 @@ from protocol.errors import MessageError, VersionError
 WIRE_VERSION = 1
 """Major version. Whatever an older process would misunderstand changes it: a field that is gone, another meaning, a new
 value of an enumeration."""
-WIRE_MINOR = 3
+WIRE_MINOR = 4
 """Of a major version; one more with each release that adds fields, which must have defaults."""
 MAX_MESSAGE_BYTES = 16 * 2**20
 MAX_MEMBERS = 2**12

@@ -23,6 +23,10 @@ Pose: TypeAlias = tuple[float, float, float, float, float]
 
 HOME: Geodetic = (47.397742, 8.545594, 488.0)
 """Origin of a world that says none: where PX4's own simulation stands."""
+EV_HORIZONTAL, EV_VERTICAL = 1, 2
+"""Bits of EKF2_EV_CTRL."""
+VISION_LOST_S = 5.0
+"""PX4's EKF2_NOAID_TOUT."""
 LIFTING = (Mode.TAKEOFF, Mode.OFFBOARD, Mode.MANUAL, Mode.ALTCTL, Mode.POSCTL, Mode.STABILISED)
 """Modes that may leave the ground."""
 
@@ -40,19 +44,21 @@ class Aircraft:
         origin = here if mission.vehicles.origin else (0.0, 0.0, 0.0)
         self.parameters = Parameters()
         self.parameters.set("MAV_SYS_ID", drone.mavlink_system)
+        if not settings.satellites:
+            self.parameters.set("EKF2_GPS_CTRL", 0)
         self.commander = Commander(self.parameters)
         self.guidance = Guidance(self.parameters)
         self.guidance.home = (here[0] - origin[0], here[1] - origin[1], here[2] - origin[2])
         self.ground = Ground(self.parameters, settings.spool_up_s)
         self.wind = Wind(settings, dice)
         self.body = Body(here, world_yaw(yaw))
-        self.estimator = Estimator(origin, settings.position_noise_m, dice)
+        self.estimator = Estimator(origin, settings.position_noise_m, dice, settings.drift_mps)
         self.battery = Battery(settings.battery_s)
         self.gimbal = Gimbal(self.parameters, settings.gimbal_rate_max_radps)
         self.origin: Geodetic = unproject(world, origin)
         """Of the local frame: GPS_GLOBAL_ORIGIN."""
         self.faults: tuple[str, ...] = ()
-        """Red checks, by what PX4 calls them."""
+        """Red checks that were put into it."""
         self.commanded: Vector = (0.0, 0.0, 0.0)
         self.now_s = 0.0
         self._setpoint_s = -math.inf
@@ -61,6 +67,18 @@ class Aircraft:
         self._mode = self.commander.mode
         self._armed = False
         self._push_until_s = -math.inf
+        self._seen_s = -math.inf
+        self._resets = 0
+
+    @property
+    def has_position(self) -> bool:
+        """Whether anything tells it: satellites, or external vision within the last seconds."""
+        return self.parameters["EKF2_GPS_CTRL"] > 0 or self.now_s - self._seen_s < VISION_LOST_S
+
+    @property
+    def red(self) -> tuple[str, ...]:
+        """All red checks, by what PX4 calls them."""
+        return self.faults if self.has_position else (*self.faults, "No valid local position estimate")
 
     @property
     def estimate(self) -> Estimate:
@@ -76,7 +94,7 @@ class Aircraft:
             self.now_s,
             self.now_s - self._setpoint_s < self.parameters["COM_OF_LOSS_T"],
             self.ground.landed,
-            self.faults,
+            self.red,
             self.battery.share,
             self._outside_fence(here.position),
             self.guidance.took_off(here),
@@ -94,6 +112,21 @@ class Aircraft:
         """An offboard setpoint arrived."""
         self.guidance.target = target
         self._setpoint_s = now_s
+
+    def see(self, position: Vector, age_s: float, resets: int, now_s: float) -> None:
+        """Where external vision saw the vehicle ``age_s`` ago, local north, east, down: EKF2_EV_CTRL says of which axes
+        it is believed. The yaw is never off here."""
+        control = int(self.parameters["EKF2_EV_CTRL"])
+        here, late_s = self.estimate, age_s + self.parameters["EKF2_EV_DELAY"] / 1e3
+        axes = control & EV_HORIZONTAL, control & EV_HORIZONTAL, control & EV_VERTICAL
+        n, e, d = (
+            seen - (own - late_s * speed) if fused else 0.0
+            for seen, own, speed, fused in zip(position, here.position, here.velocity, axes, strict=True)
+        )
+        if any(axes):
+            reset = not self.has_position or resets != self._resets
+            self.estimator.correct((n, e, d), now_s, reset=reset)
+            self._seen_s, self._resets = now_s, resets
 
     def jump(self, by: Vector) -> None:
         """The estimate moves at once by north, east, down; the vehicle does not."""

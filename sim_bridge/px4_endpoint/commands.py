@@ -22,6 +22,8 @@ UNSUPPORTED: int = mavlink.MAV_RESULT_UNSUPPORTED
 FORCED = 21196
 """Second parameter of COMPONENT_ARM_DISARM that stops the motors in flight."""
 ERROR_SEVERITY: int = mavlink.MAV_SEVERITY_ERROR
+AGE_MAX_S = 1.0
+"""Of a pose from external vision."""
 TEXT_MAX = 50
 """Bytes of one STATUSTEXT."""
 
@@ -45,6 +47,7 @@ class Commands:
             "GIMBAL_MANAGER_SET_ATTITUDE": self._gimbal_attitude,
             "GIMBAL_MANAGER_SET_PITCHYAW": self._gimbal_angles,
             "TIMESYNC": self._timesync,
+            "VISION_POSITION_ESTIMATE": self._vision,
         }
         self._commands: dict[int, Callable[[Arguments, tuple[int, int]], int]] = {
             mavlink.MAV_CMD_COMPONENT_ARM_DISARM: self._arm,
@@ -176,6 +179,14 @@ class Commands:
         return mavlink.MAVLink_param_value_message(
             name.encode(), parameters.wire(name), parameters.kind(name), count, index
         )
+
+    def _vision(self, packet: Packet, now_s: float) -> Iterator[Packet]:
+        position = (packet.x, packet.y, packet.z)
+        if all(map(math.isfinite, position)):
+            age_s = now_s - packet.usec / 1e6
+            # A stamp by another clock than ours says nothing.
+            self._aircraft.see(position, age_s if 0 <= age_s < AGE_MAX_S else 0.0, packet.reset_counter, now_s)
+        return iter(())
 
     def _timesync(self, packet: Packet, now_s: float) -> Iterator[Packet]:
         if packet.tc1 == 0:
