@@ -113,11 +113,11 @@ class Aircraft:
         self.guidance.target = target
         self._setpoint_s = now_s
 
-    def see(self, position: Vector, age_s: float, resets: int, now_s: float) -> None:
-        """Where external vision saw the vehicle ``age_s`` ago, local north, east, down: EKF2_EV_CTRL says of which axes
-        it is believed. The yaw is never off here."""
+    def see(self, position: Vector, resets: int, now_s: float) -> None:
+        """Where external vision saw the vehicle EKF2_EV_DELAY ago, local north, east, down: EKF2_EV_CTRL says of which
+        axes it is believed. The yaw is never off here."""
         control = int(self.parameters["EKF2_EV_CTRL"])
-        here, late_s = self.estimate, age_s + self.parameters["EKF2_EV_DELAY"] / 1e3
+        here, late_s = self.estimate, self.parameters["EKF2_EV_DELAY"] / 1e3
         axes = control & EV_HORIZONTAL, control & EV_HORIZONTAL, control & EV_VERTICAL
         n, e, d = (
             seen - (own - late_s * speed) if fused else 0.0

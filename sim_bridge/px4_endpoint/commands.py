@@ -22,8 +22,6 @@ UNSUPPORTED: int = mavlink.MAV_RESULT_UNSUPPORTED
 FORCED = 21196
 """Second parameter of COMPONENT_ARM_DISARM that stops the motors in flight."""
 ERROR_SEVERITY: int = mavlink.MAV_SEVERITY_ERROR
-AGE_MAX_S = 1.0
-"""Of a pose from external vision."""
 TEXT_MAX = 50
 """Bytes of one STATUSTEXT."""
 
@@ -183,9 +181,8 @@ class Commands:
     def _vision(self, packet: Packet, now_s: float) -> Iterator[Packet]:
         position = (packet.x, packet.y, packet.z)
         if all(map(math.isfinite, position)):
-            age_s = now_s - packet.usec / 1e6
-            # A stamp by another clock than ours says nothing.
-            self._aircraft.see(position, age_s if 0 <= age_s < AGE_MAX_S else 0.0, packet.reset_counter, now_s)
+            # Its stamp is by the sender's clock, and MAVSDK does not answer TIMESYNC: PX4 goes by the arrival then.
+            self._aircraft.see(position, packet.reset_counter, now_s)
         return iter(())
 
     def _timesync(self, packet: Packet, now_s: float) -> Iterator[Packet]:

@@ -126,7 +126,7 @@ def test_a_capture_that_stops_has_drones_hold_and_then_land_by_no_stale_pose(tmp
             return REAL_LOOK(self, tick, poses)
         return [ExternalPose(drone=drone, tick=tick, age_s=0.0) for drone in poses]
 
-    lost = mission(60.0, drones=1)
+    lost = mission(20.0, drones=1, lost_s=1.0)
     with captured(stop):
         flown = fly(lost, tmp_path)
     for drone, states in flown.states.items():
@@ -147,7 +147,7 @@ def test_two_confused_bodies_bring_both_drones_down_where_they_are(tmp_path: Pat
         swapped = {1: poses[2], 2: poses[1]} if tick >= STOPS_AT else poses
         return REAL_LOOK(self, tick, swapped)
 
-    confused = mission(60.0)
+    confused = mission(20.0, lost_s=1.0)
     with captured(swap):
         flown = fly(confused, tmp_path)
     assert flown.down == [True, True]

@@ -1,7 +1,8 @@
 """Tells the autopilot where it was seen from outside, as VISION_POSITION_ESTIMATE, which its EKF fuses (EKF2_EV_CTRL).
 
-In that message positions are north, east, down of the local frame, and so are the axes that the attitude refers to,
-though MAVSDK calls them the body's.
+MAVSDK 4.1.0 passes that message's stamp on as it is and answers no TIMESYNC, so PX4, which then does not know our
+clock, takes the pose for one of the moment of its arrival, less EKF2_EV_DELAY. Positions are north, east, down of the
+local frame, and so are the axes that the attitude refers to, though MAVSDK calls them the body's.
 """
 
 from __future__ import annotations
