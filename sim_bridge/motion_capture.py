@@ -20,10 +20,13 @@ S_PER_MIN = 60.0
 class SimulatedCapture:
     """One that is asked at every tick; noise and drop-outs depend on the mission's seed and the drone alone."""
 
-    def __init__(self, mission: Mission) -> None:
-        self._settings, self._noise = mission.mocap, mission.simulation.mocap
+    def __init__(self, mission: Mission, *, in_step: bool = True) -> None:
+        """``in_step``: ticks are the mission's; else those of the capture itself, which sees something at each."""
+        self._noise = mission.simulation.mocap
         self._tick_s, self._period_ticks = mission.tick_s, mission.mocap_ticks
-        self._late_ticks = round(mission.mocap.latency_s / mission.tick_s)
+        if not in_step:
+            self._tick_s, self._period_ticks = 1 / mission.mocap.rate_hz, 1
+        self._late_ticks = round(mission.mocap.latency_s / self._tick_s)
         self._dice = {
             drone.id: np.random.default_rng([mission.seed, CAPTURE_STREAM, drone.id]) for drone in mission.drones
         }
