@@ -7,6 +7,7 @@ import contextlib
 import math
 import socket
 import tempfile
+import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
@@ -15,12 +16,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from agents.localization.choice import make_pose_source
+from agents.localization.motion_capture import MotionCapture
 from agents.vehicles.px4.vehicle import Px4Vehicle
-from agents.vehicles.vehicle import SeenPose
+from agents.vehicles.vehicle import SeenPose, Telemetry
+from protocol.bus import connect
 from protocol.errors import VehicleError
 from protocol.localization_settings import Localization
 from protocol.mission import Drone, Mission
 from protocol.vehicle_settings import Autopilot, Vehicles
+from sim_bridge.px4_endpoint.capture import show
 from sim_bridge.px4_endpoint.endpoint import Endpoint
 from sim_bridge.px4_endpoint.frames import ned
 from sim_bridge.px4_endpoint.vehicle import Vehicle
@@ -137,3 +142,54 @@ async def test_poses_bound_the_drift_of_the_autopilot_s_estimate_and_arrive_as_t
         there.aircraft.estimator._drift = (0.1, 0.0, 0.0)
         await until(lambda: off_m(there) > 0.15, "it drifts without them")
         await until(lambda: not there.aircraft.has_position, "and knows in the end that it has no position")
+
+
+async def test_from_the_capture_over_the_bus_and_mavlink_a_vehicle_flies_by_poses_and_knows_when_they_stop() -> None:
+    """All but the planner: bus, the agent's source of poses, MAVSDK, and an estimator that drifts without."""
+    flown = mission(drift_mps=0.1)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        router = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    vehicle, ended = vehicle_of(flown), threading.Event()
+    async with connect(router, flown.name, router=True), connect(router, flown.name) as bus:
+        source = make_pose_source(flown, DRONE, bus, lockstep=False, now_s=time.monotonic, aid=vehicle.aid)
+        assert isinstance(source, MotionCapture)
+        with Endpoint(flown) as endpoint:
+            there = endpoint.vehicles[DRONE]
+            showing = asyncio.create_task(show(flown, router, endpoint, ended))
+            try:
+                await vehicle.prepare()
+                vehicle.take_off()
+                began_s, tick, errors = time.monotonic(), 0, []
+
+                async def flies(seconds: float, *, noted: bool) -> Telemetry:
+                    nonlocal tick
+                    ends_s = time.monotonic() + seconds
+                    while True:
+                        tick = max(tick + 1, int((time.monotonic() - began_s) / flown.tick_s))
+                        located = await source.locate(tick, vehicle.telemetry())
+                        assert located is not None
+                        vehicle.send(tick, np.array([0.2, 0.0, 0.0, 0.0, 0.0]))
+                        if noted:
+                            errors.append(math.dist(located.pose[:3], there.pose[:3]))
+                        if time.monotonic() > ends_s:
+                            return located
+                        await asyncio.sleep(flown.tick_s)
+
+                located = await flies(0.1, noted=False)
+                while vehicle.condition().authority != "ours" or located.position_sd_m > 0.05:
+                    assert time.monotonic() < began_s + PATIENCE_S, (vehicle.condition(), source.counts)
+                    located = await flies(0.1, noted=False)
+                located = await flies(2.0, noted=True)
+                assert np.median(errors) < 0.05
+                assert off_m(there) < 0.1, "the autopilot's own"
+                ended.set()
+                await showing
+                blind = await flies(3.0, noted=False)
+                assert blind.position_sd_m > 3 * located.position_sd_m, "until policies hold and land"
+                assert source.counts.taken > 20
+            finally:
+                showing.cancel()
+                await asyncio.gather(showing, return_exceptions=True)
+                source.close()
+                vehicle.close()
