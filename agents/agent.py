@@ -119,7 +119,16 @@ class Agent:
         self._news = News(bus, topics.EVENT, f"drone/{drone}", drone)
         self._hearing = Hearing(mission, drone, bus, self._replication, self._team, self._news.tell, lockstep=lockstep)
         self._vehicle = make_vehicle(mission, drone, bus, now_s=self._clock.now_s, events=self._note_event)
-        self._poses = make_pose_source(mission, drone, bus, lockstep=lockstep)
+        self._poses = make_pose_source(
+            mission,
+            drone,
+            bus,
+            lockstep=lockstep,
+            now_s=self._clock.now_s,
+            aid=self._vehicle.aid,
+            others=self._team.places,
+            tell=self._news.tell,
+        )
         self._orders = Orders(mission, self._clock.now_s, self._news.tell)
         self._operator = DroneOrder(drone=drone, action="fly", number=0)
         self._reserve = Reserve(mission, drone, self._watch.obstacles)
@@ -456,7 +465,7 @@ class Agent:
             refused=self._bus.statistics.unused + self._replication.refused,
             telemetry_age_s=age_s,
         )
-        if self._obstacles is not None:
+        if self._mission.flight.obstacles.enabled:
             margin = rows.margin("obstacle", UNLIMITED)
             self._control = self._control.model_copy(update={"obstacle_margin_m": margin})
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from agents.barriers import Neighbour, predicted_pose
+from protocol.geometry import Floats
 from protocol.messages import DroneState
 from protocol.mission import Flight
 from protocol.separation import position_error
@@ -33,6 +34,7 @@ class Team:
     def __init__(self, own: int, starts: Mapping[int, Sequence[float]], flight: Flight, tick_s: float) -> None:
         self._own, self._flight, self._tick_s = own, flight, tick_s
         self._last_seen = {drone: _Seen(0, start, (0.0,) * 5) for drone, start in starts.items() if drone != own}
+        self._seen_before: dict[int, _Seen] = {}
 
     def hear(self, state: DroneState | Sighting, now: int) -> None:
         """``now``: this drone's own newest tick. An older state never replaces a newer one, and none is younger than
@@ -41,9 +43,20 @@ class Team:
         known = self._last_seen.get(state.drone)
         if state.drone != self._own and (known is None or known.tick <= state.tick):
             tick = min(state.tick, now + 1)
+            if known is not None and known.tick < tick:
+                self._seen_before[state.drone] = known
             self._last_seen[state.drone] = _Seen(
                 tick, state.pose, state.velocity, state.blind_s, state.landed, state.position_sd_m, state.climb_m or 0.0
             )
+
+    def places(self, tick: int) -> Floats:
+        """(n, 4) x, y, z where the others last said, before ``tick``, that they were, and the standard deviation; in
+        lockstep the same, whoever speaks first."""
+        said = [
+            seen if seen.tick < tick else self._seen_before.get(drone, seen)
+            for drone, seen in sorted(self._last_seen.items())
+        ]
+        return np.array([(*seen.pose[:3], seen.position_sd_m) for seen in said]).reshape(-1, 4)
 
     def neighbours(
         self, tick: int, delay_s: float = 0.0, position_sd_m: float = 0.0, height_m: float = 0.0

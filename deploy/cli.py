@@ -309,6 +309,7 @@ def _process(command: str, module: str, what: str) -> None:
 _process("agent", "agents", "one drone")
 _process("console", "ground_station.console", "the page in the browser")
 _process("ground", "ground_station", "the ground station")
+_process("mocap", "ground_station.motion_capture", "the bridge from a motion capture system")
 _process("router", "protocol.router", "the router")
 _process("sim", "sim_bridge", "the simulator")
 _process("px4-endpoint", "sim_bridge.px4_endpoint", "PX4-like vehicles that speak MAVLink")

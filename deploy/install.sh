@@ -124,7 +124,7 @@ if [[ ${1:-} == tests ]]; then
     install_browser
     install_hosts
     echo "install: test tools, about 2.5 GB more"
-    install_packages "$python" --editable '.[ground,camera,lidar]' --group dev
+    install_packages "$python" --editable '.[ground,camera,lidar,mocap]' --group dev
     install_torch
 else
     echo "install: about 1 GB into .venv, once; a few minutes"

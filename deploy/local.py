@@ -39,9 +39,9 @@ LOG_BYTES = 16 * 1024
 BAD_INPUT = 2
 """Exit code of a process that refuses its mission, scene or endpoint; any other failure is 1."""
 
-Kind = Literal["router", "ground", "sim", "observer", "autopilots", "agent", "console", "mapper"]
+Kind = Literal["router", "ground", "sim", "observer", "autopilots", "agent", "console", "mapper", "mocap"]
 """sim and autopilots carry vehicles, an observer only watches them."""
-SERVANTS: tuple[Kind, ...] = ("router", "autopilots", "console", "mapper")
+SERVANTS: tuple[Kind, ...] = ("router", "autopilots", "console", "mapper", "mocap")
 """Serve until the others are gone, and go with the group."""
 
 
@@ -74,11 +74,13 @@ def mission_roles(
     autopilots: bool = False,
     console: bool = False,
     mapper: Sequence[str] = (),
+    mocap: bool = False,
 ) -> list[Role]:
     """Router, simulator, ground station and one agent a drone; all read ``mission.json`` in the run folder.
 
     ``px4``: the vehicles are not the simulator's. ``autopilots``: they are PX4-like ones of our own. ``console``: with
-    the page in the browser. ``mapper``: command of a process of the user's own that makes the map.
+    the page in the browser. ``mapper``: command of a process of the user's own that makes the map. ``mocap``:
+    with what passes the poses of motion capture on.
     """
     told = ("--mission", str(run / "mission.json"), "--endpoint", endpoint, "--run", str(run), "--speed", speed)
 
@@ -92,6 +94,7 @@ def mission_roles(
         role("sim", "observer" if px4 else "sim", "sim_bridge"),
         role("ground", "ground", "ground_station"),
         *([Role("mapper", "mapper", (*mapper, *told))] if mapper else []),
+        *([role("mocap", "mocap", "ground_station.motion_capture")] if mocap else []),
         *([role("console", "console", "ground_station.console")] if console else []),
         *(role(f"drone-{drone}", "agent", "agents", "--drone", str(drone)) for drone in drones),
     ]
@@ -176,7 +179,7 @@ class _Run:
         else:
             self._say(_obituary(role, code, self._logs))
             self._result = self._result or (BAD_INPUT if code == BAD_INPUT else 1)
-            self._hopeless |= role.kind not in ("agent", "observer", "console", "mapper")
+            self._hopeless |= role.kind not in ("agent", "observer", "console", "mapper", "mocap")
 
     def _may_start_again(self, role: Role, code: int) -> bool:
         mortal = role.kind not in ("sim", "autopilots") and code != BAD_INPUT and not self._over

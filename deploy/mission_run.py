@@ -61,6 +61,7 @@ def fly(
             autopilots=with_autopilots,
             console=with_console,
             mapper=mapper,
+            mocap=mission.localization.source == "mocap" and mission.vehicles.kind == "px4" and not with_autopilots,
         )
         with display:
             compile_everything(mission)

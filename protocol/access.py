@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator
 from typing import Any
 
-from protocol.credentials import GROUND, MAPPER, ROUTER, SIM, identity_of_name
+from protocol.credentials import GROUND, MAPPER, MOCAP, ROUTER, SIM, identity_of_name
 from protocol.topics import TOPICS, Party, Topic, alive_key
 from protocol.wire import Message
 
@@ -62,6 +62,8 @@ def _rules_of(identity: str, drones: Collection[int]) -> list[Rule]:
         return list(_party(identity, "sim", "*", "sim"))
     if identity == MAPPER:
         return list(_party(identity, "mapper", "", "mapper"))
+    if identity == MOCAP:
+        return list(_party(identity, "mocap", "*", "mocap"))
     if kind == "drone" and int(rest) in drones:
         return list(_party(identity, "agent", rest, f"drone/{rest}"))
     if kind == "operator":

@@ -30,7 +30,7 @@ from protocol.certificates import (
 from protocol.errors import CredentialsError
 
 AUTHORITY_FILE, REGISTER_FILE = "ca.pem", "register.json"
-ROUTER, GROUND, SIM, MAPPER = "router", "ground", "sim", "mapper"
+ROUTER, GROUND, SIM, MAPPER, MOCAP = "router", "ground", "sim", "mapper", "mocap"
 DRONE, OPERATOR = "drone", "operator"
 """Kinds of which there are several: ``drone-<id>``, ``operator-<name>``."""
 
@@ -38,14 +38,13 @@ EXPIRY_WARNING = timedelta(days=14)
 """A certificate that ends sooner is warned of: two weeks are enough to visit every drone."""
 
 _IDENTITY = (
-    f"{ROUTER}|{GROUND}|{SIM}|{MAPPER}"
+    f"{ROUTER}|{GROUND}|{SIM}|{MAPPER}|{MOCAP}"
     f"|{DRONE}-(?:[1-9][0-9]?|1[0-9]{{2}}|2[0-4][0-9]|25[0-5])"
     f"|{OPERATOR}-[a-z0-9](?:[a-z0-9-]{{0,30}}[a-z0-9])?"
 )
 _ISSUE = "[1-9][0-9]{0,5}"
-IDENTITIES = (
-    f"{ROUTER}, {GROUND}, {SIM}, {MAPPER}, {DRONE}-1 to {DRONE}-255, and {OPERATOR}-<name> of small letters and digits"
-)
+_ONE_OF_A_KIND = ", ".join((ROUTER, GROUND, SIM, MAPPER, MOCAP))
+IDENTITIES = f"{_ONE_OF_A_KIND}, {DRONE}-1 to {DRONE}-255, and {OPERATOR}-<name> of small letters and digits"
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,6 +36,18 @@ def camera_rotation(yaw_rad: float, pitch_rad: float) -> Floats:
     return np.column_stack([right, np.cross(forward, right), forward])
 
 
+def rotation_of_quaternion(quaternion: tuple[float, float, float, float]) -> Floats:
+    """(3, 3) of w, x, y, z, of any length but none."""
+    w, x, y, z = np.array(quaternion) / math.hypot(*quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
 def turn_matrix(vector: Floats) -> Floats:
     """(3, 3) rotation about ``vector`` by its length (Rodrigues)."""
     angle = float(np.linalg.norm(vector))

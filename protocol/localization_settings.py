@@ -1,4 +1,4 @@
-"""Where drones take their poses from, and what their lidar is: ``[localization]`` and ``[lidar]`` of a mission file."""
+"""Where drones take their poses from: ``[localization]``, ``[lidar]`` and ``[mocap]`` of a mission file."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from protocol.settings import Angle, NonNegative, Positive, Settings
 class Localization(Settings):
     """Where poses come from, and what is done with bad ones (docs/localization.md)."""
 
-    source: Literal["vehicle", "lidar"] = "vehicle"
-    """The vehicle's own estimate, motion capture or GNSS behind it; or KISS-ICP on a lidar's scans, fused with the
-    vehicle's velocity from a known start on (extra ``lidar``)."""
+    source: Literal["vehicle", "lidar", "mocap"] = "vehicle"
+    """The vehicle's own estimate, motion capture or GNSS behind it; or KISS-ICP on a lidar's scans (extra ``lidar``),
+    or what motion capture or another eye outside sees of it (``[mocap]``), both fused with the vehicle's velocity."""
     deviation_max_m: Positive = 0.2
     """A drone whose position has a larger standard deviation holds ..."""
     lost_s: Positive = 5.0
@@ -27,7 +27,7 @@ class Localization(Settings):
     start_deviation_m: Positive = 0.01
     """Standard deviation of the place where a drone knows itself at first, unless its vehicle tells a larger one."""
     velocity_error_mps: Positive = 0.05
-    """Of the vehicle's velocity, each axis: what "lidar" expects of its slow error. Optical flow's."""
+    """Of the vehicle's velocity, each axis: what "lidar" and "mocap" expect of its slow error. Optical flow's."""
 
 
 class Lidar(Settings):
@@ -78,3 +78,36 @@ class EstimateNoise(Settings):
     @property
     def is_silent(self) -> bool:
         return not any((self.drift_m, self.drift_rad, self.velocity_mps, self.white_m, self.white_rad))
+
+
+class Mocap(Settings):
+    """What ``localization.source`` "mocap" expects of motion capture, and where to find it (docs/localization.md)."""
+
+    system: Literal["optitrack", "qualisys", "vicon", "vrpn", "mock"] = "vrpn"
+    """Whose poses ``covrecon mocap`` passes on (extra ``mocap``); mock: bodies that stand where their drones start."""
+    host: str = "127.0.0.1"
+    """The computer that runs its software."""
+    rate_hz: Positive = 50.0
+    """Poses of each drone, a second, at most; a simulated capture sends no more than one a tick."""
+    deviation_m: Positive = 0.002
+    """Standard deviation of each coordinate of a pose that tells none; no fused position is better ..."""
+    deviation_rad: Positive = 0.01
+    """... and of its yaw, likewise."""
+    latency_s: Annotated[float, Field(ge=0, le=0.5)] = 0.0
+    """How old a pose is when it is passed on: cameras, software and the way to us. Of a simulated capture too."""
+    reacquire_s: Positive = 0.5
+    """A drone whose position has become unsure believes poses again that agree for so long with each other and with
+    its velocity."""
+
+
+class CaptureNoise(Settings):
+    """What is wrong with a simulated capture: ``[simulation.mocap]``."""
+
+    noise_m: NonNegative = 0.001
+    """Standard deviation of each coordinate ..."""
+    noise_rad: NonNegative = 0.003
+    """... and of the yaw."""
+    dropouts_per_min: NonNegative = 0.0
+    """How often, in the mean, a body is lost from view ..."""
+    dropout_s: Positive = 1.0
+    """... for so long."""

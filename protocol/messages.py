@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from protocol.wire import Finite, Message, WireArray
 
@@ -17,6 +18,18 @@ Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
 Vector3 = tuple[Coordinate, Coordinate, Coordinate]
 Vector5 = tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate]
 """x, y, z, camera yaw, camera pitch (depression), or their rates."""
+
+
+def _of_length_one(quaternion: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    if abs(math.hypot(*quaternion) - 1) > QUATERNION_TOLERANCE:
+        raise ValueError(f"no rotation: its length is {math.hypot(*quaternion):g}, not 1")
+    return quaternion
+
+
+QUATERNION_TOLERANCE = 0.01
+"""Of a rotation's length: float32 rounding is far below, a fault far above."""
+Quaternion = Annotated[tuple[Finite, Finite, Finite, Finite], AfterValidator(_of_length_one)]
+"""w, x, y, z."""
 Deviation = Annotated[float, Field(ge=0, le=1e6)]
 """Standard deviation, in metres or radians; 0 where nobody tells one."""
 UNLIMITED = 1e9
@@ -233,6 +246,24 @@ class LidarScan(Message):
     """int16 (n, 3) millimetres, as seen from the sensor, levelled: x forward along the vehicle's yaw, y left, z up."""
 
 
+class ExternalPose(Message):
+    """Where motion capture, or whoever else looks from outside, sees a drone's body; empty while it does not."""
+
+    name: ClassVar[str] = "external_pose"
+    drone: DroneId
+    tick: TickNumber
+    """The newest of the mission when this was said, 0 before the first ..."""
+    age_s: Annotated[float, Field(ge=0, le=60)]
+    """... and how long before it was true."""
+    position: Vector3 | None = None
+    attitude: Quaternion | None = None
+    """Of the body's axes (x forward, y left, z up) in the world's."""
+    position_sd_m: Deviation = 0.0
+    """Standard deviation of each coordinate ..."""
+    angle_sd_rad: Deviation = 0.0
+    """... and of the attitude about each axis; 0: ``[mocap]`` of the mission says them."""
+
+
 class Jump(Message):
     """One map update's effect on phi, eq. (4); applied once and in order of ``sequence`` within ``epoch``."""
 
@@ -342,7 +373,7 @@ class Event(Message):
     level: EventLevel
     kind: Annotated[str, Field(max_length=40)]
     """What it is about: "mode", "order", "solver", "vehicle", "battery", "phi", "command", "link", "map",
-    "disk"."""
+    "disk", "position"."""
     text: Text
 
 

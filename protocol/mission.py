@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 
 from protocol.battery_settings import Battery, battery_faults
 from protocol.geometry import Intrinsics
-from protocol.localization_settings import EstimateNoise, Lidar, Localization
+from protocol.localization_settings import CaptureNoise, EstimateNoise, Lidar, Localization, Mocap
 from protocol.map_settings import Camera, Feedback, Reconstruction
 from protocol.obstacle_settings import Obstacles
 from protocol.operation_settings import Console, Metrics, Recording
@@ -230,6 +230,7 @@ class Simulation(Settings):
     pose_noise_rad: NonNegative = 0.0
     """... and of its attitude. Independent from frame to frame; how the vehicles fly does not change."""
     estimate: EstimateNoise = EstimateNoise()
+    mocap: CaptureNoise = CaptureNoise()
     battery: Battery = Battery()
     vehicle_radius_m: Positive = 0.15
     """Of the sphere that a vehicle is: where it touches the scene, that is counted."""
@@ -269,6 +270,13 @@ class Drone(Settings):
     camera: str = ""
     """This drone's real camera: an RTSP URL, a V4L2 device such as /dev/video0, or a video file. Empty: the simulator
     renders what it would see."""
+    body: str = ""
+    """Name of its rigid body in the motion capture; empty: "drone-" and its id."""
+
+    @property
+    def rigid_body(self) -> str:
+        """The name of its body in the motion capture."""
+        return self.body or f"drone-{self.id}"
 
     @property
     def mavlink_system(self) -> int:
@@ -296,6 +304,7 @@ class Mission(Settings):
     camera: Camera = Camera()
     localization: Localization = Localization()
     lidar: Lidar = Lidar()
+    mocap: Mocap = Mocap()
     reconstruction: Reconstruction = Reconstruction()
     simulation: Simulation = Simulation()
     vehicles: Vehicles = Vehicles()
@@ -320,6 +329,11 @@ class Mission(Settings):
     def scan_ticks(self) -> int:
         """Between two scans of a lidar."""
         return round(self.controller.rate_hz / self.lidar.rate_hz)
+
+    @property
+    def mocap_ticks(self) -> int:
+        """Between two poses of a simulated capture."""
+        return max(1, round(self.controller.rate_hz / self.mocap.rate_hz))
 
     def sweep_intrinsics(self) -> Intrinsics:
         """Of depth images, computed and measured."""
@@ -396,6 +410,8 @@ class Mission(Settings):
             ]
         if self.localization.source == "lidar":
             faults += self._lidar_faults()
+        if self.localization.source == "mocap":
+            faults += self._mocap_faults()
         faults += battery_faults(self.simulation.battery, self.vehicles)
         if self.vehicles.kind == "px4" or self.vehicles.battery_swap_s > 0:
             faults += self._column_faults()
@@ -414,6 +430,21 @@ class Mission(Settings):
             faults.append('localization.source: "lidar" needs a scene to measure, simulation.scene')
         if self.lidar.rate_hz > self.controller.rate_hz:
             faults.append(f"lidar.rate_hz: must be at most controller.rate_hz, {self.controller.rate_hz:g}")
+        return faults
+
+    def _mocap_faults(self) -> list[str]:
+        faults = []
+        if self.vehicles.origin is not None:
+            faults.append("vehicles.origin: must be left out, the world frame is the motion capture's")
+        if self.vehicles.camera_mount == "gimbal":
+            faults.append(
+                'vehicles.camera_mount: "gimbal" turns the camera, and motion capture sees the vehicle\'s yaw'
+            )
+        bodies: dict[str, int] = {}
+        for index, drone in enumerate(self.drones):
+            if bodies.setdefault(drone.rigid_body, drone.id) != drone.id:
+                taken = bodies[drone.rigid_body]
+                faults.append(f"drones.{index}.body: {drone.rigid_body!r} is drone {taken}'s already")
         return faults
 
     def _vehicle_faults(self) -> list[str]:

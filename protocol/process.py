@@ -13,7 +13,7 @@ from pathlib import Path
 
 import uvloop
 
-from protocol.credentials import GROUND, MAPPER, OPERATOR, ROUTER, SIM, identity_of_drone
+from protocol.credentials import GROUND, MAPPER, MOCAP, OPERATOR, ROUTER, SIM, identity_of_drone
 from protocol.errors import BusError, CovreconError, CredentialsError, MissionError, SceneError, VehicleError
 from protocol.guard import require_own_packages
 from protocol.links import link_of
@@ -31,6 +31,7 @@ IDENTITIES = {
     "ground_station": GROUND,
     "sim_bridge": SIM,
     "ground_station.console": OPERATOR,
+    "ground_station.motion_capture": MOCAP,
     "mapper": MAPPER,
 }
 """Who each kind of process is, by its module; a mapper's is the user's own, and an agent is its drone."""

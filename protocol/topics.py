@@ -14,10 +14,10 @@ from protocol.errors import MessageError
 from protocol.wire import MAX_MESSAGE_BYTES, Message, decode
 
 M = TypeVar("M", bound=Message)
-Party = Literal["agent", "ground", "sim", "operator", "mapper", "router"]
+Party = Literal["agent", "ground", "sim", "operator", "mapper", "mocap", "router"]
 """Kinds of process. sim: the internal simulator or the observer; operator: console, command line, live table; mapper: a
-process of the user's own that makes the map. What the router itself reads and writes passes no access rules: they are
-its own."""
+process of the user's own that makes the map; mocap: what passes on the poses of motion capture. What the router itself
+reads and writes passes no access rules: they are its own."""
 Priority = Literal["REAL_TIME", "INTERACTIVE_HIGH", "INTERACTIVE_LOW", "DATA_HIGH", "DATA", "DATA_LOW", "BACKGROUND"]
 
 
@@ -91,7 +91,9 @@ SETPOINT = Topic("drone/{drone}/setpoint", messages.Setpoint, ("agent",), ("sim"
                  "REAL_TIME", 256, 0.5, True, 1 * _KIB, express=True)
 SCAN = Topic("drone/{drone}/scan", messages.LidarScan, ("sim",), ("agent",),
              "DATA_HIGH", 4, 0.5, False, 512 * _KIB)
-TICK = Topic("clock/tick", messages.Tick, ("sim",), ("agent", "ground", "operator", "router"),
+MOCAP = Topic("drone/{drone}/mocap", messages.ExternalPose, ("sim", "mocap"), ("agent",),
+              "REAL_TIME", 16, 0.5, False, 1 * _KIB, express=True)
+TICK = Topic("clock/tick", messages.Tick, ("sim",), ("agent", "ground", "operator", "mocap", "router"),
              "REAL_TIME", 256, 0.5, True, 256 * _KIB, express=True)
 JUMP = Topic("phi/jump", messages.Jump, ("ground",), ("agent", "operator"),
              "DATA_HIGH", 256, _NO_AGE, True, 8 * _MIB)
@@ -105,7 +107,7 @@ BLOCKS = Topic("phi/blocks", messages.PhiPage, ("ground",), ("agent", "operator"
                "BACKGROUND", 16, _NO_AGE, False, MAX_MESSAGE_BYTES, queryable=True)
 DRONE_BLOCKS = Topic("drone/{drone}/phi", messages.PhiPage, ("agent",), ("agent", "ground", "operator"),
                      "BACKGROUND", 16, _NO_AGE, False, MAX_MESSAGE_BYTES, queryable=True)
-PHASE = Topic("command/all", messages.MissionPhase, ("ground",), ("agent", "sim", "operator"),
+PHASE = Topic("command/all", messages.MissionPhase, ("ground",), ("agent", "sim", "operator", "mocap"),
               "REAL_TIME", 16, 2.0, True, 256 * _KIB, express=True)
 COMMAND = Topic("command/request", messages.CommandReply, ("ground",), ("operator",),
                 "REAL_TIME", 16, _NO_AGE, False, 16 * _KIB, queryable=True)
@@ -126,8 +128,8 @@ STATUS = Topic("status", messages.Status, ("ground",), ("operator",),
 # fmt: on
 
 TOPICS: tuple[Topic[Message], ...] = (  # type: ignore[assignment]  # read-only use of an invariant generic
-    STATE, TEAM, KEYFRAME, SETPOINT, SCAN, TICK, JUMP, HEAD, JOURNAL, DIGEST, BLOCKS, DRONE_BLOCKS, PHASE, COMMAND,
-    EVENT, GROUND_EVENT, MAP, FREE, MAP_KEYFRAMES, EXTERNAL_MESH, STATUS,
+    STATE, TEAM, KEYFRAME, SETPOINT, SCAN, MOCAP, TICK, JUMP, HEAD, JOURNAL, DIGEST, BLOCKS, DRONE_BLOCKS, PHASE,
+    COMMAND, EVENT, GROUND_EVENT, MAP, FREE, MAP_KEYFRAMES, EXTERNAL_MESH, STATUS,
 )  # fmt: skip
 
 

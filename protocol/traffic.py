@@ -183,6 +183,8 @@ def _told(mission: Mission, drone: int, plan: Plan) -> Iterator[tuple[Topic[Any]
                 yield topics.STATE, "down", rate_hz, message, _spelt_bytes(topics.STATE, other.id)
     if mission.localization.source == "lidar":
         yield topics.SCAN, "down", rate_hz / mission.scan_ticks, traffic_samples.scan(mission, drone), 0
+    if mission.localization.source == "mocap":
+        yield topics.MOCAP, "down", mission.mocap.rate_hz, traffic_samples.external_pose(drone), 0
     yield topics.HEAD, "down", rate_hz / HEAD_EVERY_TICKS, traffic_samples.head(), 0
     yield topics.PHASE, "down", 1 / PHASE_PERIOD_S, traffic_samples.phase(), 0
     yield topics.DIGEST, "down", 1 / mission.replication.digest_period_s, traffic_samples.digest(mission), 0

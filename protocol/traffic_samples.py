@@ -12,6 +12,7 @@ from protocol.field import VirtualField
 from protocol.messages import (
     Control,
     DroneState,
+    ExternalPose,
     FreeCells,
     Jump,
     JumpHead,
@@ -115,6 +116,19 @@ def setpoint(drone: int) -> Setpoint:
 def scan(mission: Mission, drone: int) -> LidarScan:
     """Of which every ray comes back."""
     return LidarScan(drone=drone, tick=TICK, points=np.zeros((mission.lidar.rays, 3), np.int16))
+
+
+def external_pose(drone: int) -> ExternalPose:
+    x, y, z, _, _ = pose(drone, TICK)
+    return ExternalPose(
+        drone=drone,
+        tick=TICK,
+        age_s=0.0123,
+        position=(x, y, z),
+        attitude=(0.97, 0.01, -0.02, 0.24),
+        position_sd_m=0.00123,
+        angle_sd_rad=0.0123,
+    )
 
 
 def keyframe(mission: Mission, drone: int, jpeg_bytes: int, depth_bytes: int = 0) -> Keyframe:

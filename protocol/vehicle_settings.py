@@ -93,6 +93,10 @@ class Autopilot(Settings):
     """Standard deviation of what comes on top, with a second of memory."""
     position_noise_m: NonNegative = 0.02
     """Standard deviation of the estimate's slow wandering, each axis."""
+    drift_mps: NonNegative = 0.0
+    """How fast the estimate runs away from the place, in some direction, while external vision does not correct it."""
+    satellites: bool = True
+    """Whether there are any: without, EKF2_GPS_CTRL is 0, and there is no position before external vision tells it."""
     battery_s: Positive = 1200.0
     """Flight time of a full battery. The crew changes it by ``vehicles.battery_swap_s`` and ``battery_spares``."""
     power_off_s: NonNegative = 0.0

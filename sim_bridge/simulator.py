@@ -28,6 +28,7 @@ from sim_bridge.believed import BelievedPoses
 from sim_bridge.darkroom import Darkroom
 from sim_bridge.dynamics import VehicleBody
 from sim_bridge.estimate import EstimateError
+from sim_bridge.motion_capture import SimulatedCapture
 from sim_bridge.observer import Observer
 from sim_bridge.roll_call import MissionWatch, wait_for_everybody
 from sim_bridge.scanner import Scanner
@@ -72,6 +73,7 @@ class Simulator:
         }
         self._contacts = contacts
         self._scanner = Scanner(bus, lidar, mission.scan_ticks)
+        self._capture = SimulatedCapture(mission) if mission.localization.source == "mocap" else None
         noise = mission.simulation.estimate
         self._errors = {
             drone: EstimateError(noise, mission.seed, drone, mission.tick_s)
@@ -125,6 +127,8 @@ class Simulator:
                 if self._believed is not None:
                     self._believed.note_truth(self._tick, poses, self._velocities())
                 self._publish(self._beat())
+                for seen in [] if self._capture is None else self._capture.look(self._tick, poses):
+                    self._bus.put(topics.MOCAP, seen, seen.drone)
                 await self._scanner.scan(self._tick, poses, wait=self._lockstep)
                 await self._photograph(poses)
                 if self._lockstep:

@@ -11,11 +11,12 @@ import asyncio
 import logging
 from collections import deque
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from agents.localization.pose_filter import PoseFilter, largest_deviation
+from agents.localization.carrier import Carrier
+from agents.localization.pose_filter import PoseFilter
 from agents.localization.registrar import Job, Registrar, RegistrarProcess
 from agents.localization.registration import MAP_SD_M, MAP_SD_RAD, Registration
 from agents.vehicles.vehicle import Telemetry
@@ -34,7 +35,6 @@ LOCKSTEP_PATIENCE_S = 15.0
 out only when something hangs."""
 LOCKSTEP_QUEUE = 8
 """Scans that may have come before their turn, in lockstep; in real time the newest alone."""
-YAW = 3
 
 
 @dataclass(slots=True)
@@ -54,8 +54,8 @@ class LidarOdometry:
         """``registrar``: a process of its own if none is given."""
         self._mission, self._bus, self._lockstep, self._drone = mission, bus, lockstep, drone
         self._registrar = registrar or RegistrarProcess(mission.lidar)
-        self._filter: PoseFilter | None = None
-        self._velocity = np.zeros(4)
+        expected_mps = mission.localization.velocity_error_mps
+        self._carrier = Carrier(mission.tick_s, expected_mps, MAP_SD_M, MAP_SD_RAD)
         self._scans: deque[LidarScan] = deque(maxlen=LOCKSTEP_QUEUE if lockstep else 1)
         self._asked: tuple[int, Future[Registration]] | None = None
         self._kept: Floats | None = None
@@ -68,7 +68,7 @@ class LidarOdometry:
 
     def close(self) -> None:
         self._registrar.close()
-        if self._filter is not None:
+        if self._carrier.filter is not None:
             log.info("drone %d: lidar: %s", self._drone, self.counts)
 
     def _hear(self, scan: LidarScan) -> None:
@@ -90,43 +90,31 @@ class LidarOdometry:
         if self._lockstep:
             await self._wait_for_scan(tick - 1)
         self._submit(tick)
-        return self._fused(telemetry, self._carry(tick, telemetry))
+        return self._carrier.fused(telemetry, self._carry(tick, telemetry))
 
     async def _wait_for_result(self, tick: int) -> None:
         if self._asked is not None and self._asked[0] + EFFECT_TICKS <= tick:
             await asyncio.wait({asyncio.wrap_future(self._asked[1])}, timeout=LOCKSTEP_PATIENCE_S)
 
     async def _wait_for_scan(self, due: int) -> None:
-        if due % self._mission.scan_ticks or self._filter is None or self._filter.at(due) is None:
+        if due % self._mission.scan_ticks or self._carrier.filter is None or self._carrier.filter.at(due) is None:
             return
         if not await self._bus.until(lambda: any(scan.tick >= due for scan in self._scans), LOCKSTEP_PATIENCE_S):
             log.warning("drone %d: the scan of tick %d did not come: this run cannot be repeated", self._drone, due)
             self.counts.missed += 1
 
     def _carry(self, tick: int, telemetry: Telemetry) -> PoseFilter:
-        settings, velocity = self._mission.localization, telemetry.velocity[:4]
-        if self._filter is None:
-            self._filter = PoseFilter(
-                tick,
-                telemetry.pose[:4],
-                max(settings.start_deviation_m, telemetry.position_sd_m),
-                max(MAP_SD_RAD, telemetry.angle_sd_rad),
-                settings.velocity_error_mps,
-            )
-        elif tick > self._filter.tick:
-            elapsed_s = (tick - self._filter.tick) * self._mission.tick_s
-            self._filter.advance(tick, (velocity + self._velocity) / 2, elapsed_s)
-        self._velocity = velocity.copy()
-        return self._filter
+        start_m = max(self._mission.localization.start_deviation_m, telemetry.position_sd_m)
+        return self._carrier.carry(tick, telemetry, start_m, max(MAP_SD_RAD, telemetry.angle_sd_rad))
 
     def _submit(self, tick: int) -> None:
         """Have the oldest scan from before ``tick`` registered, if nothing else is."""
-        if self._filter is None or self._asked is not None or self._broken:
+        if self._carrier.filter is None or self._asked is not None or self._broken:
             return
         if not self._scans or self._scans[0].tick >= tick:
             return
         scan = self._scans.popleft()
-        guess = self._filter.at(scan.tick)
+        guess = self._carrier.filter.at(scan.tick)
         if guess is None:  # from before the first tick, or of one that was passed over
             self.counts.missed += 1
             return
@@ -140,7 +128,7 @@ class LidarOdometry:
         if self._lockstep and asked + EFFECT_TICKS > tick:
             return
         self._asked = None
-        located = self._filter
+        located = self._carrier.filter
         error = future.exception()
         if error is not None or located is None:
             log.error("drone %d: scans are registered no longer: %s", self._drone, error)
@@ -152,16 +140,3 @@ class LidarOdometry:
             self._kept = located.at(asked)
         else:
             self.counts.refused += 1
-
-    def _fused(self, telemetry: Telemetry, located: PoseFilter) -> Telemetry:
-        pose, velocity = telemetry.pose.copy(), telemetry.velocity.copy()
-        pose[:4] = located.pose
-        velocity[:3] -= located.velocity_error
-        covariance = located.covariance
-        return replace(
-            telemetry,
-            pose=pose,
-            velocity=velocity,
-            position_sd_m=(largest_deviation(covariance[:3, :3]) ** 2 + MAP_SD_M**2) ** 0.5,
-            angle_sd_rad=(covariance[YAW, YAW] + MAP_SD_RAD**2) ** 0.5,
-        )

@@ -85,6 +85,22 @@ class PoseFilter:
         self._moments.append(self._carried(self._moments[-1], tick, velocity, elapsed_s))
         del self._moments[:-KEPT_TICKS]
 
+    @property
+    def step(self) -> tuple[Floats, float]:
+        """The velocity (4,) with which it was carried last, and for how many seconds."""
+        return self._moments[-1].velocity, self._moments[-1].elapsed_s
+
+    def anew(self, tick: int, pose: Floats, deviation_m: float, deviation_rad: float) -> PoseFilter | None:
+        """Another one that began at an earlier ``tick`` with ``pose`` (4,), carried by the same velocities since; None
+        where that is forgotten or was passed over."""
+        found = self._find(tick)
+        if found is None:
+            return None
+        fresh = PoseFilter(tick, pose, deviation_m, deviation_rad, self._velocity_sd)
+        for later in self._moments[found + 1 :]:
+            fresh.advance(later.tick, later.velocity, later.elapsed_s)
+        return fresh
+
     def correct(self, tick: int, pose: Floats, covariance: Floats) -> bool:
         """Take in ``pose`` (4,) with ``covariance`` (4, 4), true at ``tick``; whether it was near enough to be
         believed, and not too late."""

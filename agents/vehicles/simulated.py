@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from agents.vehicles.vehicle import Authority, Condition, Telemetry
+from agents.vehicles.vehicle import Authority, Condition, SeenPose, Telemetry
 from protocol import topics
 from protocol.bus import Bus
 from protocol.geometry import Floats
@@ -104,6 +104,9 @@ class SimulatedVehicle:
             self._send(tick, np.clip(climb, -self._limit, self._limit), take_off=True)
         else:
             self.send(tick, np.zeros(5))
+
+    def aid(self, seen: SeenPose) -> None:
+        """Nothing: its estimate is the simulator's."""
 
     def stop(self) -> None:
         self.send(self._tick, np.zeros(5))

@@ -40,6 +40,24 @@ class Telemetry:
 
 
 @dataclass(frozen=True, slots=True)
+class SeenPose:
+    """Where the vehicle's body was seen from outside, world frame."""
+
+    position: Floats
+    """(3,)"""
+    rotation: Floats
+    """(3, 3) body (x forward, y left, z up) to world."""
+    position_sd_m: float
+    """Standard deviation of each coordinate ..."""
+    angle_sd_rad: float
+    """... and about each axis."""
+    at_s: float
+    """When it was true, by the same clock as `Telemetry.stamp_s`."""
+    resets: int = 0
+    """How often so far what is seen has been believed anew, elsewhere than expected."""
+
+
+@dataclass(frozen=True, slots=True)
 class Condition:
     authority: Authority
     reason: str = ""
@@ -71,6 +89,10 @@ class Vehicle(Protocol):
 
     def telemetry(self) -> Telemetry | None:
         """None before the first one."""
+        ...
+
+    def aid(self, seen: SeenPose) -> None:
+        """For the vehicle's own estimator, where it has one; also before `prepare` has ended, which may wait for it."""
         ...
 
     def send(self, tick: int, velocity: Floats) -> Floats:

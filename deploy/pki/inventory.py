@@ -17,6 +17,7 @@ from protocol.credentials import (
     EXPIRY_WARNING,
     GROUND,
     MAPPER,
+    MOCAP,
     OPERATOR,
     REGISTER_FILE,
     ROUTER,
@@ -125,7 +126,7 @@ def _items(entries: Sequence[Entry], now: datetime) -> Iterator[Item]:
 def _order(item: Item) -> tuple[int, int, str, int]:
     """The ground station's computer first, then drones by number, then operators by name."""
     kind, _, rest = item.name.partition("-")
-    kinds = (ROUTER, GROUND, SIM, MAPPER, DRONE, OPERATOR)
+    kinds = (ROUTER, GROUND, SIM, MAPPER, MOCAP, DRONE, OPERATOR)
     return kinds.index(kind), int(rest) if kind == DRONE else 0, rest, item.issue
 
 

@@ -29,6 +29,10 @@ HOME: Geodetic = (47.397742, 8.545594, 488.0)
 """Origin of a world that says none: where PX4's own simulation stands."""
 KNOWS_BATTERY_S = 2.0
 """After booting, until the share of the battery is known."""
+EV_HORIZONTAL, EV_VERTICAL = 1, 2
+"""Bits of EKF2_EV_CTRL."""
+VISION_LOST_S = 5.0
+"""PX4's EKF2_NOAID_TOUT."""
 LIFTING = (Mode.TAKEOFF, Mode.OFFBOARD, Mode.MANUAL, Mode.ALTCTL, Mode.POSCTL, Mode.STABILISED)
 """Modes that may leave the ground."""
 
@@ -44,12 +48,14 @@ class Aircraft:
         self._settings, self._world = settings, mission.vehicles.origin
         self.parameters = Parameters()
         self.parameters.set("MAV_SYS_ID", drone.mavlink_system)
+        if not settings.satellites:
+            self.parameters.set("EKF2_GPS_CTRL", 0)
         self.wind = Wind(settings, dice)
         self.body = Body(ned((x, y, 0.0)), world_yaw(yaw))
         self.battery = Battery(settings.battery_s, mission.vehicles.battery_swap_s, mission.vehicles.battery_spares)
         self.gimbal = Gimbal(self.parameters, settings.gimbal_rate_max_radps)
         self.faults: tuple[str, ...] = ()
-        """Red checks, by what PX4 calls them."""
+        """Red checks that were put into it."""
         self.power_off_s = settings.power_off_s
         """How long changing the battery takes its power."""
         self.tells_battery = True
@@ -74,13 +80,15 @@ class Aircraft:
         self.guidance = Guidance(self.parameters)
         self.guidance.home = (here[0] - origin[0], here[1] - origin[1], here[2] - origin[2])
         self.ground = Ground(self.parameters, self._settings.spool_up_s)
-        self.estimator = Estimator(origin, self._settings.position_noise_m, self._dice)
+        self.estimator = Estimator(origin, self._settings.position_noise_m, self._dice, self._settings.drift_mps)
         self.origin: Geodetic = unproject(self._world or HOME, origin)
         """Of the local frame: GPS_GLOBAL_ORIGIN."""
         self.commanded: Vector = (0.0, 0.0, 0.0)
         self._setpoint_s = -math.inf
         self._mode = self.commander.mode
         self._armed = False
+        self._seen_s = -math.inf
+        self._resets = 0
 
     @property
     def is_off(self) -> bool:
@@ -97,6 +105,16 @@ class Aircraft:
         return self.tells_battery and (self.boots == 0 or self.up_s > KNOWS_BATTERY_S)
 
     @property
+    def has_position(self) -> bool:
+        """Whether anything tells it: satellites, or external vision within the last seconds."""
+        return self.parameters["EKF2_GPS_CTRL"] > 0 or self.now_s - self._seen_s < VISION_LOST_S
+
+    @property
+    def red(self) -> tuple[str, ...]:
+        """All red checks, by what PX4 calls them."""
+        return self.faults if self.has_position else (*self.faults, "No valid local position estimate")
+
+    @property
     def estimate(self) -> Estimate:
         body, estimator = self.body, self.estimator
         v, push = body.velocity, body.push
@@ -110,7 +128,7 @@ class Aircraft:
             self.now_s,
             self.now_s - self._setpoint_s < self.parameters["COM_OF_LOSS_T"],
             self.ground.landed,
-            self.faults,
+            self.red,
             self.battery.share,
             self._outside_fence(here.position),
             self.guidance.took_off(here),
@@ -128,6 +146,21 @@ class Aircraft:
         """An offboard setpoint arrived."""
         self.guidance.target = target
         self._setpoint_s = now_s
+
+    def see(self, position: Vector, resets: int, now_s: float) -> None:
+        """Where external vision saw the vehicle EKF2_EV_DELAY ago, local north, east, down: EKF2_EV_CTRL says of which
+        axes it is believed. The yaw is never off here."""
+        control = int(self.parameters["EKF2_EV_CTRL"])
+        here, late_s = self.estimate, self.parameters["EKF2_EV_DELAY"] / 1e3
+        axes = control & EV_HORIZONTAL, control & EV_HORIZONTAL, control & EV_VERTICAL
+        n, e, d = (
+            seen - (own - late_s * speed) if fused else 0.0
+            for seen, own, speed, fused in zip(position, here.position, here.velocity, axes, strict=True)
+        )
+        if any(axes):
+            reset = not self.has_position or resets != self._resets
+            self.estimator.correct((n, e, d), now_s, reset=reset)
+            self._seen_s, self._resets = now_s, resets
 
     def jump(self, by: Vector) -> None:
         """The estimate moves at once by north, east, down; the vehicle does not."""

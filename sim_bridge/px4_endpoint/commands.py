@@ -45,6 +45,7 @@ class Commands:
             "GIMBAL_MANAGER_SET_ATTITUDE": self._gimbal_attitude,
             "GIMBAL_MANAGER_SET_PITCHYAW": self._gimbal_angles,
             "TIMESYNC": self._timesync,
+            "VISION_POSITION_ESTIMATE": self._vision,
         }
         self._commands: dict[int, Callable[[Arguments, tuple[int, int]], int]] = {
             mavlink.MAV_CMD_COMPONENT_ARM_DISARM: self._arm,
@@ -176,6 +177,13 @@ class Commands:
         return mavlink.MAVLink_param_value_message(
             name.encode(), parameters.wire(name), parameters.kind(name), count, index
         )
+
+    def _vision(self, packet: Packet, now_s: float) -> Iterator[Packet]:
+        position = (packet.x, packet.y, packet.z)
+        if all(map(math.isfinite, position)):
+            # Its stamp is by the sender's clock, and MAVSDK does not answer TIMESYNC: PX4 goes by the arrival then.
+            self._aircraft.see(position, packet.reset_counter, now_s)
+        return iter(())
 
     def _timesync(self, packet: Packet, now_s: float) -> Iterator[Packet]:
         if packet.tc1 == 0:

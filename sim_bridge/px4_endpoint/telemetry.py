@@ -54,7 +54,7 @@ def sys_status(aircraft: Aircraft) -> Packet:
     for bit in SENSORS.values():
         present |= bit
     healthy = present
-    for fault in aircraft.faults:
+    for fault in aircraft.red:
         healthy &= ~(PREARM | SENSORS.get(fault, 0))
     battery = aircraft.battery
     return mavlink.MAVLink_sys_status_message(
@@ -245,6 +245,9 @@ ON_REQUEST: dict[int, Report] = {
     mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_INFORMATION: gimbal_device_information,
 }
 """What is sent only when asked for."""
+
+POSITION = (mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT)
+"""Messages that are not sent while there is no position."""
 
 GIMBAL = (
     mavlink.MAVLINK_MSG_ID_GIMBAL_MANAGER_INFORMATION,

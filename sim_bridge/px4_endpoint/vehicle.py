@@ -36,7 +36,7 @@ from sim_bridge.px4_endpoint.link import Link
 from sim_bridge.px4_endpoint.modes import Mode
 from sim_bridge.px4_endpoint.setpoint_times import SetpointTimes
 from sim_bridge.px4_endpoint.streams import Streams
-from sim_bridge.px4_endpoint.telemetry import GIMBAL, STREAMS
+from sim_bridge.px4_endpoint.telemetry import GIMBAL, POSITION, STREAMS
 
 TEXT_NUMBER_MAX = 0xFFFF
 
@@ -93,9 +93,9 @@ class Vehicle:
             self._streams.reset()
             log.info("drone %d: booted", self.drone.id)
         self._tell()
-        gimbal_silent = self.aircraft.gimbal.silent
+        mute = (*(GIMBAL if self.aircraft.gimbal.silent else ()), *(() if self.aircraft.has_position else POSITION))
         for message in self._streams.due(now_s):
-            if not (gimbal_silent and message in GIMBAL):
+            if message not in mute:
                 self.link.send(STREAMS[message][1](self.aircraft))
 
     def read(self, now_s: float) -> None:

@@ -9,6 +9,7 @@ part alone.
 
 from __future__ import annotations
 
+import asyncio
 import json
 import math
 import sys
@@ -16,18 +17,26 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
+from agents.localization.choice import make_pose_source
+from agents.localization.motion_capture import MotionCapture
 from agents.localization.pose_filter import PoseFilter, largest_deviation
 from agents.localization.registration import MAP_SD_M, MAP_SD_RAD, ScanRegistration
+from agents.vehicles.vehicle import Telemetry
 from faults.localization_flights import NOISE, fly_all
 from faults.measured_page import write_measured
+from protocol.bus import Bus
 from protocol.geometry import Floats
-from protocol.localization_settings import Lidar
+from protocol.localization_settings import CaptureNoise, Lidar, Localization
+from protocol.messages import ExternalPose
+from protocol.mission import Drone, Mission, Simulation
 from protocol.separation import SIGMAS
 from sim_bridge.estimate import EstimateError
 from sim_bridge.lidar import directions, measure
+from sim_bridge.motion_capture import SimulatedCapture
 from sim_bridge.scenes.cache import scene_cache
 from sim_bridge.scenes.lighting import ray_caster
 from sim_bridge.scenes.scene import load_scene
@@ -87,6 +96,11 @@ SENSORS: Mapping[str, Pattern | None] = {
     "fixed rings": rings,
     "depth camera that looks down": depth_camera,
 }
+CAPTURES: Mapping[str, CaptureNoise] = {
+    "motion capture": CaptureNoise(),
+    "motion capture, out of sight": CaptureNoise(dropouts_per_min=6.0, dropout_s=2.0),
+}
+"""Out of sight: for two seconds, six times a minute in the mean."""
 
 
 # --- along a path ----------------------------------------------------------------------------------------------------
@@ -148,6 +162,49 @@ def fly_path(pattern: Pattern | None, seconds: int, seed: int = 1) -> Track:
     )  # fmt: skip
 
 
+class OneHandlerBus:
+    """All of a bus that motion capture's poses take, without one: what is said is there at once."""
+
+    def on(self, _topic: object, handler: Callable[[ExternalPose], None], _drone: int) -> None:
+        self.deliver = handler
+
+    async def until(self, condition: Callable[[], bool], _timeout_s: float) -> bool:
+        return condition()
+
+
+async def fly_path_seen(noise: CaptureNoise, seconds: int, seed: int = 1) -> Track:
+    """With the agent's own source of poses; the first second, in which it finds itself, does not count."""
+    mission = Mission(
+        seed=seed,
+        duration_s=seconds,
+        simulation=Simulation(estimate=NOISE, mocap=noise),
+        localization=Localization(source="mocap"),
+        drones=(Drone(id=1, start=(0.0, 1.0, 2.0, 0.0, 1.3)),),
+    )
+    capture, bus, error = SimulatedCapture(mission), OneHandlerBus(), EstimateError(NOISE, seed, 1, TICK_S)
+    source = make_pose_source(mission, 1, cast("Bus", bus), lockstep=True)
+    assert isinstance(source, MotionCapture)
+    errors, yaws, told = [], [], []
+    for tick in range(round(seconds / TICK_S) + 1):
+        time_s = tick * TICK_S
+        truth = path(time_s)
+        for seen in capture.look(tick, {1: truth}):
+            bus.deliver(seen)
+        believed = Telemetry(error.pose(truth), error.velocity(path_velocity(time_s)), 1.0, time_s)
+        located = await source.locate(tick, believed)
+        assert located is not None
+        error.step()
+        if time_s > 1.0:
+            errors.append(math.dist(located.pose[:3], truth[:3]))
+            yaws.append(abs(math.remainder(located.pose[3] - truth[3], math.tau)))
+            told.append(located.position_sd_m)
+    off, sure = np.array(errors), np.array(told)
+    return Track(
+        off[-1], math.sqrt((off**2).mean()), off.max(), max(yaws), sure.mean(), float((off > SIGMAS * sure).mean()),
+        source.counts.refused, 0.0, 0.0,
+    )  # fmt: skip
+
+
 # --- the page --------------------------------------------------------------------------------------------------------
 
 
@@ -164,12 +221,17 @@ def sensors(folder: Path) -> Iterator[str]:
         "|---|---|---|---|---|---|---|---|",
     ]
     for seconds in SECONDS:
-        for name, pattern in SENSORS.items():
+        for name in (*SENSORS, *CAPTURES):
             file = folder / f"track-{name.replace(' ', '-')}-{seconds}.json"
             if not file.exists():
-                file.write_text(json.dumps(asdict(fly_path(pattern, seconds))))
+                flown = (
+                    asyncio.run(fly_path_seen(CAPTURES[name], seconds))
+                    if name in CAPTURES
+                    else fly_path(SENSORS[name], seconds)
+                )
+                file.write_text(json.dumps(asdict(flown)))
             track = Track(**json.loads(file.read_text()))
-            cost = f"{track.scan_ms:.0f} ({track.scan_p95_ms:.0f})" if pattern else "–"
+            cost = f"{track.scan_ms:.0f} ({track.scan_p95_ms:.0f})" if track.scan_ms else "–"
             lines.append(
                 f"| {name} | {seconds} | {cm(track.final_m)} / {cm(track.rms_m)} / {cm(track.max_m)}"
                 f" | {math.degrees(track.yaw_max_rad):.2f} | {cm(track.told_m)} | {track.beyond:.1%}"

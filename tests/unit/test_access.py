@@ -23,9 +23,17 @@ ADMITTED = (
     "drone-9.1",
     "operator-anna.1",
     "mapper.1",
+    "mocap.1",
 )
 DRONES = {1, 2}
-PARTY = {"ground": "ground", "sim": "sim", "drone-1": "agent", "operator-anna": "operator", "mapper": "mapper"}
+PARTY = {
+    "ground": "ground",
+    "sim": "sim",
+    "drone-1": "agent",
+    "operator-anna": "operator",
+    "mapper": "mapper",
+    "mocap": "mocap",
+}
 each_topic = pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.key)
 each_identity = pytest.mark.parametrize("identity", PARTY)
 
@@ -93,7 +101,8 @@ def test_a_drone_writes_no_other_drones_keys(control: Mapping[str, Any], topic: 
 
 
 def test_each_process_lives_under_its_own_name_alone(control: Mapping[str, Any]) -> None:
-    roles = {"ground": "ground", "sim": "sim", "drone-1": "drone/1", "drone-2": "drone/2", "mapper": "mapper"}
+    roles = {"ground": "ground", "sim": "sim", "drone-1": "drone/1", "drone-2": "drone/2"}
+    roles |= {"mapper": "mapper", "mocap": "mocap"}
     for identity in (*roles, "operator-anna"):
         for role in roles.values():
             alone = roles.get(identity) == role

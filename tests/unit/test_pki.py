@@ -181,7 +181,7 @@ def test_only_parties_of_a_fleet_are_issued_certificates(fleet: Path) -> None:
     for identity in ("drone-0", "drone-3.1", "ca", "../x", "operator-Anna"):
         message = refusal(lambda identity=identity: issue(fleet, [identity], now=NOW))  # type: ignore[misc]
         assert message.startswith(
-            f"{identity!r} cannot have a certificate; there are router, ground, sim, mapper, drone-1 to"
+            f"{identity!r} cannot have a certificate; there are router, ground, sim, mapper, mocap, drone-1 to"
         )
 
 

@@ -158,3 +158,14 @@ def test_errors_lie_within_what_is_told() -> None:
         error = (located.pose - true)[:3]
         beyond += error @ np.linalg.solve(located.covariance[:3, :3], error) > 14.16  # chi-squared, 3 degrees: 99.7 %
     assert beyond <= 5
+
+
+def test_one_that_began_at_an_earlier_tick_was_carried_by_the_same_velocities() -> None:
+    located = started()
+    advance(located, 10)
+    advance(located, 10, np.array([0.0, 0.5, 0.0, 0.0]))
+    fresh = located.anew(4, np.zeros(4), 0.01, 0.01)
+    assert fresh is not None
+    assert fresh.tick == located.tick
+    assert fresh.pose == pytest.approx([6 * TICK_S * 0.4, 10 * TICK_S * 0.5, 0.0, 6 * TICK_S * 0.1])
+    assert located.anew(99, np.zeros(4), 0.01, 0.01) is None

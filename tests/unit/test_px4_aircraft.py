@@ -324,3 +324,68 @@ def test_nobody_changes_a_battery_that_has_not_flown_or_without_a_spare() -> Non
     for full in (True, False):
         battery.drain(2.0)
         assert any(battery.stand(0.5) for _ in range(4)) is full
+
+
+# --- external vision -------------------------------------------------------------------------------------------------
+
+DRIFTING = Autopilot(position_noise_m=0.0, drift_mps=0.2)
+
+
+def off_m(aircraft: Aircraft) -> float:
+    return math.dist(aircraft.estimate.position, aircraft.body.position)
+
+
+def seen(flight: Flight, seconds: float, late_s: float = 0.0) -> None:
+    """By a capture with fifty poses a second."""
+    places = [flight.aircraft.body.position] * (1 + round(late_s / 0.02))
+    for _ in range(round(seconds / 0.02)):
+        flight.run(0.02)
+        places.append(flight.aircraft.body.position)
+        flight.aircraft.see(places[-1 - round(late_s / 0.02)], 0, flight.now_s)
+
+
+def test_an_estimate_that_drifts_is_kept_by_what_is_seen_and_drifts_on_without() -> None:
+    flight = Flight(origin=None, settings=DRIFTING)
+    flight.run(5.0)
+    assert off_m(flight.aircraft) == pytest.approx(5.1 * 0.2, rel=0.01)
+    seen(flight, 5.0)
+    assert off_m(flight.aircraft) < 0.01
+    flight.run(5.0)
+    assert off_m(flight.aircraft) < 0.05, "the drift has been learned"
+
+
+def test_axes_that_are_not_fused_drift_on() -> None:
+    flight = Flight(origin=None, settings=DRIFTING, EKF2_EV_CTRL=2)
+    seen(flight, 5.0)
+    error = [a - b for a, b in zip(flight.aircraft.estimate.position, flight.aircraft.body.position, strict=True)]
+    assert abs(error[2]) < 0.01
+    assert math.hypot(error[0], error[1]) > 0.1
+
+
+def test_without_satellites_there_is_no_position_before_it_is_seen_nor_long_after() -> None:
+    flight = Flight(origin=None, settings=Autopilot(position_noise_m=0.0, satellites=False))
+    assert not flight.aircraft.has_position
+    assert flight.aircraft.red == ("No valid local position estimate",)
+    flight.aircraft.see((4.0, 5.0, -1.0), 0, flight.now_s)
+    assert flight.aircraft.estimate.position == pytest.approx((4.0, 5.0, -1.0)), "its frame is what sees it"
+    assert (flight.aircraft.has_position, flight.aircraft.red) == (True, ())
+    flight.run(5.1)
+    assert not flight.aircraft.has_position
+
+
+def test_another_reset_counter_moves_the_estimate_at_once() -> None:
+    flight = Flight(origin=None)
+    here = flight.aircraft.body.position
+    flight.aircraft.see((here[0] + 1.0, here[1], here[2]), 0, flight.now_s)
+    assert 0.1 < off_m(flight.aircraft) < 0.3
+    flight.aircraft.see((here[0] + 1.0, here[1], here[2]), 1, flight.now_s)
+    assert off_m(flight.aircraft) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("delay_ms", "wrong_m"), [(0.0, 0.1), (200.0, 0.0)])
+def test_the_delay_that_the_parameter_says_is_flown_on(delay_ms: float, wrong_m: float) -> None:
+    flight = Flight(origin=None, EKF2_EV_DELAY=delay_ms)
+    flight.take_off()
+    flight.fly(0.5, 0.0, 0.0)
+    seen(flight, 6.0, late_s=0.2)
+    assert off_m(flight.aircraft) == pytest.approx(wrong_m, abs=0.03)

@@ -152,3 +152,15 @@ def test_a_pitch_setpoint_stops_at_its_limits_and_says_so() -> None:
     assert setpoint.advance(0.5, 0.1, 1.48) == pytest.approx(0.2)
     assert setpoint.angle_rad == 1.5
     assert setpoint.advance(0.5, 0.1, 1.5) == 0.0
+
+
+@given(TILTS, TILTS, ANGLES)
+def test_an_attitude_seen_from_outside_is_the_one_that_px4_means(roll: float, pitch: float, yaw: float) -> None:
+    forward_left_up = frames.NED_TO_WORLD @ frames.body_rotation(roll, pitch, yaw) @ np.diag([1.0, -1.0, -1.0])
+    found = frames.ned_attitude(forward_left_up)
+    assert found[:2] == pytest.approx((roll, pitch), abs=1e-9)
+    assert math.remainder(found[2] - yaw, math.tau) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_level_body_that_looks_along_x_heads_east() -> None:
+    assert frames.ned_attitude(np.eye(3)) == pytest.approx((0.0, 0.0, math.pi / 2))

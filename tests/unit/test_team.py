@@ -149,3 +149,13 @@ def test_of_what_the_mission_and_a_drone_say_of_its_error_the_larger_counts() ->
 
     assert [neighbour.error_m for neighbour in known.neighbours(8)] == pytest.approx([0.0, 0.05])
     assert known.neighbours(8, position_sd_m=0.1)[0].error_m == pytest.approx(0.05)
+
+
+def test_where_others_said_to_be_before_a_tick_does_not_depend_on_who_spoke_first_in_it() -> None:
+    known = team()
+    known.hear(state(1, 7, 1.0), now=7)
+    known.hear(state(5, 7, 3.0), now=7)
+    before = known.places(8).tolist()
+    known.hear(state(1, 8, 1.5), now=8)
+    assert known.places(8).tolist() == before
+    assert [x for x, *_ in known.places(9).tolist()] == [1.5, 3.0]

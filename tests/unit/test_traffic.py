@@ -69,6 +69,7 @@ def test_every_topic_of_an_agent_is_planned_or_known_to_be_irregular() -> None:
             with_camera(2),
             with_obstacles(),
             team(1, localization=Localization(source="lidar")),
+            team(1, localization=Localization(source="mocap")),
         )
         for flow in traffic_of(mission, 1).flows
     }
@@ -93,6 +94,7 @@ def test_samples_are_messages_that_travel() -> None:
         traffic_samples.tick(mission),
         traffic_samples.setpoint(9),
         traffic_samples.scan(mission, 9),
+        traffic_samples.external_pose(9),
         traffic_samples.keyframe(mission, 9, 1000),
         traffic_samples.head(),
         traffic_samples.phase(),

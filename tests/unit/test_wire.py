@@ -23,6 +23,7 @@ from protocol.messages import (
     DroneStatus,
     Event,
     ExternalMesh,
+    ExternalPose,
     FreeCells,
     JournalPage,
     Jump,
@@ -160,6 +161,15 @@ EXAMPLES: tuple[Message, ...] = (
         earlier_rows=np.array([0], np.uint8),
         earlier_ticks=np.array([41], np.int32),
         earlier_poses=np.array([[1.5, 2.5, 3.0, 0.5, 1.25]]),
+    ),
+    ExternalPose(
+        drone=2,
+        tick=12,
+        age_s=0.25,
+        position=(0.5, -1.5, 2.0),
+        attitude=(0.5, 0.5, -0.5, 0.5),
+        position_sd_m=0.125,
+        angle_sd_rad=0.25,
     ),
     LidarScan(drone=2, tick=12, points=np.array([[100, -20, 30], [5, 6, -32000]], np.int16)),
     Status(
@@ -323,6 +333,18 @@ def test_a_keyframe_of_a_release_without_depth_cameras_has_none() -> None:
     assert decode(Keyframe, msgpack.packb(fields)) == example.model_copy(update={"depth": b""})
 
 
+@pytest.mark.parametrize("attitude", [(0.0, 0.0, 0.0, 0.0), (1.0, 1.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 1.0)])
+def test_an_attitude_that_is_no_rotation_is_refused(attitude: tuple[float, ...]) -> None:
+    (example,) = (message for message in EXAMPLES if isinstance(message, ExternalPose))
+    with pytest.raises(MessageError, match=r"external_pose\.attitude"):
+        decode(ExternalPose, msgpack.packb(unpacked(example) | {"attitude": attitude}))
+
+
+def test_what_does_not_see_a_drone_says_so_by_a_pose_without_place() -> None:
+    found = decode(ExternalPose, encode(ExternalPose(drone=1, tick=3, age_s=0.0)))
+    assert (found.position, found.attitude) == (None, None)
+
+
 @pytest.mark.parametrize("minor", [-1, True, 1.0, "1", None, [1]])
 def test_a_minor_version_that_is_no_number_is_refused(minor: object) -> None:
     with pytest.raises(MessageError, match=r"jump_head: minor wire version"):
@@ -378,11 +400,12 @@ def test_a_number_that_is_not_finite_is_refused_wherever_it_stands(message: Mess
 def test_a_value_of_another_type_is_refused_wherever_it_stands(message: Message) -> None:
     """Nothing is converted: no "3" for 3, no true for 1, no 1.0 for 1, no text for bytes."""
     fields = unpacked(message)
+    optional = {"control", "climb_m"} | ({"position", "attitude"} if isinstance(message, ExternalPose) else set())
     for place, value in places(fields):
         others: list[object] = ["3", b"3", True, None, 2.5, 3, [], {}]
         same_kind = (int, float) if type(value) is float else (type(value),)
         for other in others:
-            if type(other) in same_kind or (other is None and place[-1] in ("control", "climb_m")):
+            if type(other) in same_kind or (other is None and place[-1] in optional):
                 continue
             with pytest.raises(MessageError):
                 decode(type(message), replaced(fields, place, other))

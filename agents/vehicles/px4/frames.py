@@ -103,6 +103,16 @@ def body_rotation(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Floats:
     )
 
 
+def ned_attitude(body_to_world: Floats) -> tuple[float, float, float]:
+    """Roll, pitch and yaw, 3-2-1 sequence, FRD to NED, of a rotation (3, 3) whose body axes are forward, left, up."""
+    rotation = NED_TO_WORLD @ body_to_world @ np.diag([1.0, -1.0, -1.0])
+    return (
+        math.atan2(rotation[2, 1], rotation[2, 2]),
+        math.asin(min(1.0, max(-1.0, -rotation[2, 0]))),
+        math.atan2(rotation[1, 0], rotation[0, 0]),
+    )
+
+
 def fixed_camera_rotation(roll_rad: float, pitch_rad: float, yaw_rad: float, depression_rad: float) -> Floats:
     """Camera to world, (3, 3), of a camera fixed to an airframe with this attitude, looking ``depression_rad`` below
     its nose. Level, it is `protocol.geometry.camera_rotation`."""

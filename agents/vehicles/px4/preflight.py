@@ -25,6 +25,8 @@ class Readings:
     battery: float | None
     health: Health | None
     pointing: Pointing | None = None
+    seen: bool | None = None
+    """Whether poses from outside come; None where none are asked for."""
     undone: Mapping[str, str] | None = None
     """Steps of the preparation that have not succeeded yet, and why: "parameters", "gimbal", ..."""
 
@@ -45,6 +47,8 @@ def checklist(readings: Readings, mission: Mission, drone: int, aim: Aim | None,
     one. ``again``: it has flown already, and may have come down elsewhere than at its start. A vehicle found in the air
     is asked only for what flying it takes."""
     items = [_heard(readings)]
+    if readings.seen is not None:
+        items.append(Item("motion capture", "" if readings.seen else "no poses of this drone come"))
     items += [Item(name, fault) for name, fault in (readings.undone or {}).items()]
     items += _health(readings, mission)
     if readings.is_airborne:

@@ -16,6 +16,7 @@ from mavsdk.plugins.param import Param
 from mavsdk.plugins.telemetry import Telemetry
 
 from agents.vehicles.px4.commands import Commands
+from agents.vehicles.px4.external_pose import ExternalPoseLink
 from agents.vehicles.px4.frames import GlobalPosition, LocalFrame, offset, world_yaw
 from agents.vehicles.px4.gimbal import Aim, GimbalLink
 from agents.vehicles.px4.parameters import apply_parameters, needed_parameters
@@ -48,9 +49,17 @@ class Prepared:
 class Preparation:
     """Steps that block, each done once; those that fail are tried again until the time is over."""
 
-    def __init__(self, system: System, slots: TelemetrySlots, mission: Mission, drone: int) -> None:
-        """Raises: VehicleError: the connection is gone."""
-        self._slots, self._mission, self._drone = slots, mission, drone
+    def __init__(
+        self,
+        system: System,
+        slots: TelemetrySlots,
+        mission: Mission,
+        drone: int,
+        external: ExternalPoseLink | None = None,
+    ) -> None:
+        """``external``: what passes poses from outside on, where they are asked for. Raises: VehicleError: the
+        connection is gone."""
+        self._slots, self._mission, self._drone, self._external = slots, mission, drone, external
         self._start = mission.drone(drone).start
         mount = mission.vehicles.camera_mount
         with refusals("attaching to the vehicle"):
@@ -144,7 +153,11 @@ class Preparation:
         motion, position = fresh(slots.motion), None
         if motion is not None and self._frame is not None:
             position = self._frame.to_world(motion.position)
+        seen = None
+        if self._external is not None:
+            seen = self._external.sent_s is not None and self._external.sent_s >= oldest_s
         return Readings(
+            seen=seen,
             position=position,
             has_attitude=fresh(slots.attitude) is not None,
             mode=fresh(slots.mode),

@@ -18,13 +18,14 @@ from mavsdk import System
 from agents.vehicles.px4 import frames
 from agents.vehicles.px4.authority import FAILSAFES, AuthorityLogic, Observation, Step
 from agents.vehicles.px4.connection import Connection
+from agents.vehicles.px4.external_pose import ExternalPoseLink
 from agents.vehicles.px4.gimbal import Aim, GimbalWatch
 from agents.vehicles.px4.pilot import Pilot
 from agents.vehicles.px4.preparation import Preparation, Prepared, UntilTooLate, prepare_vehicle
 from agents.vehicles.px4.recheck import Recheck
 from agents.vehicles.px4.setpoint import AngleSetpoint, yaw_setpoint
 from agents.vehicles.px4.telemetry_slots import TelemetrySlots
-from agents.vehicles.vehicle import Condition, Telemetry
+from agents.vehicles.vehicle import Condition, SeenPose, Telemetry
 from protocol.errors import VehicleError
 from protocol.geometry import Floats
 from protocol.mission import Mission
@@ -68,6 +69,7 @@ class Px4Vehicle:
         """Of those on the ground, how many were noticed."""
         self._stood: Telemetry | None = None
         """The newest from before such a silence, until its place has been asked for anew."""
+        self._external: ExternalPoseLink | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._loop_thread = 0
         self._pilot: asyncio.Task[None] | None = None
@@ -87,7 +89,9 @@ class Px4Vehicle:
         self._loop, self._loop_thread = asyncio.get_running_loop(), threading.get_ident()
         try:
             system = await self._connect()
-            preparation = Preparation(system, self._slots, self._mission, self._drone)
+            if self._mission.localization.source == "mocap":
+                self._external = ExternalPoseLink(system, self._now_s)
+            preparation = Preparation(system, self._slots, self._mission, self._drone, self._external)
             patience = UntilTooLate(self._mission, self._drone, self._now_s)
             self._prepared = await prepare_vehicle(preparation, self._executor, self._now_s, self._events, patience)
             self._again = Recheck(preparation, self._executor, self._now_s, self._events)
@@ -130,6 +134,11 @@ class Px4Vehicle:
             return False
         with self._lock:
             return self._logic.make_ready(self._now_s())
+
+    def aid(self, seen: SeenPose) -> None:
+        """Once it is connected; in the event loop."""
+        if self._external is not None:
+            self._external.send(seen)
 
     # What it says
 
@@ -285,7 +294,7 @@ class Px4Vehicle:
             self._tell("error", f"left to itself: {error}")
 
     def close(self) -> None:
-        self._prepared = None
+        self._prepared = self._external = None
         if self._pilot is not None:
             self._pilot.cancel()
         if self._again is not None:
