@@ -107,33 +107,35 @@ class SafetyFilter:
     def brake(self, rows: Rows, low: Floats, high: Floats) -> Floats:
         """Stop; or, where strict rows are broken already, undo that as fast as the vehicle can: away from the nearest
         neighbour first, else out of zones and obstacles, else up past obstacles, else back into the box and the
-        gimbal's range. Where each of these would break another row at that speed, the one that may be flown fastest."""
+        gimbal's range. Where each of these would break another row at that speed, it leaves obstacles as fast as it
+        may."""
         slower: Floats = np.zeros(5)
-        for wish in self._retreats(rows):
+        for kind, wish in self._retreats(rows):
             retreat: Floats = np.clip(wish, low, high)
             share = _allowed_share(rows, retreat)
             if share == 1.0:
                 return retreat
-            if share * np.linalg.norm(retreat) > np.linalg.norm(slower):
+            if kind == OBSTACLE and share * np.linalg.norm(retreat) > np.linalg.norm(slower):
                 slower = share * retreat
         return slower
 
-    def _retreats(self, rows: Rows) -> Iterator[Floats]:
-        """Velocities (5,) that undo what is broken, the most urgent first."""
+    def _retreats(self, rows: Rows) -> Iterator[tuple[str, Floats]]:
+        """Velocities (5,) that undo what is broken, and of which kind that is, the most urgent first."""
         speed = top_speed(self._mission.flight)
-        for direction in [
-            *self._from_others(rows),
-            *self._out_of(rows, ZONE),
-            *self._out_of(rows, OBSTACLE),
-            *self._up_past(rows),
-        ]:
-            yield speed * direction
+        for kind, directions in (
+            (SEPARATION, self._from_others(rows)),
+            (ZONE, self._out_of(rows, ZONE)),
+            (OBSTACLE, self._out_of(rows, OBSTACLE)),
+            (OBSTACLE, self._up_past(rows)),
+        ):
+            for direction in directions:
+                yield kind, speed * direction
         inwards: Floats = np.zeros(5)
         for k in np.flatnonzero(rows.barriers[:FIXED_ROWS] < 0):
             axis = int(np.abs(rows.coefficients[k]).argmax())  # each of these rows is about one
             inwards[axis] = rows.bounds[k] / rows.coefficients[k, axis]
         if inwards.any():
-            yield inwards
+            yield "region", inwards
 
     def _from_others(self, rows: Rows) -> Iterator[Floats]:
         """The direction (5,) away from the nearest neighbour, if it is too near."""

@@ -13,6 +13,7 @@ from faults.judgement import kept_keyframes
 from faults.px4_flight import HOME_M, PATIENCE_S, FlownDrone, Px4Flight, px4_flight, px4_mission
 from protocol.mission import Mission
 from protocol.session import Link
+from protocol.verbs import Verb
 from sim_bridge.px4_endpoint.endpoint import Endpoint
 
 pytestmark = [pytest.mark.processes, pytest.mark.timeout(300)]
@@ -53,19 +54,21 @@ async def test_a_mission_whose_batteries_are_changed_with_the_power_on_and_off(t
             drones.create_task(it_flies_on(flight, flight.drones[off_id], boots=1))
             drones.create_task(it_stays(flight, flight.drones[lost_id]))
         await flight.until(flight.processes.monitor.is_healed, "all to know all of phi")
-        await flight.until(lambda: flight.processes.code("ground") is not None, "the mission to end", 90.0)
+        await ordered(flight, "land", [*flight.drones])
+        await flight.until(lambda: flight.processes.code("ground") is not None, "the mission to end", 60.0)
         for drone in flight.drones.values():
             await drone.until_down()
         flight.judge({})
         summary = json.loads((flight.processes.run / "summary.json").read_bytes())
-        assert summary["J"] < mission.stop_below
+        assert summary["exit_reason"] == "all drones have landed"
+        assert summary["J"] < 0.5
         assert kept_keyframes(flight.processes.run) == summary["keyframes"] > 0
         assert flight.drones[lost_id].vehicle.aircraft.boots == 1
 
 
-async def resume(flight: Px4Flight, drone: FlownDrone) -> None:
+async def ordered(flight: Px4Flight, verb: Verb, drones: list[int]) -> None:
     place = Place(Link(flight.processes.endpoint), flight.processes.mission.name)
-    await command(place, "resume", [drone.id], say=lambda _: None, patience_s=PATIENCE_S)
+    await command(place, verb, drones, say=lambda _: None, patience_s=PATIENCE_S)
 
 
 async def it_comes_down(drone: FlownDrone) -> None:
@@ -85,7 +88,7 @@ async def it_flies_on(flight: Px4Flight, drone: FlownDrone, *, boots: int) -> No
     assert not drone.said("no sound telemetry", after=landed), "who stands on the ground is known to, though silent"
     marked = len(drone.log)
     assert drone.is_down, "until somebody says that hands are off"
-    await resume(flight, drone)
+    await ordered(flight, "resume", [drone.id])
     await drone.until_said("preflight, on the ground: .*: all fine", after=landed)
     await drone.until_said("fly: as planned", after=marked)
     await drone.until_it_moves_on()
@@ -95,7 +98,7 @@ async def it_stays(flight: Px4Flight, drone: FlownDrone) -> None:
     """And the others keep clear of where it truly is."""
     await it_comes_down(drone)
     await drone.until_said(r"its estimate moved by 2\.\d m on the ground: stays there")
-    await resume(flight, drone)
+    await ordered(flight, "resume", [drone.id])
     states = flight.processes.monitor.states
     await drone.until(lambda: abs(states[drone.id].pose[0] - drone.position[0]) < HOME_M, "to stand where it stands")
     assert not drone.said("another battery is in")

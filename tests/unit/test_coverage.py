@@ -61,7 +61,7 @@ def decide(
     """One decision of a controller whose solver says ``outcome`` and, whatever it says, a velocity and a slack."""
     controller = CoverageController(mission, neighbours=2)
     program = ScriptedProgram(Solution(outcome, np.full(5, 0.3), -7.0, ("bound:x",)))
-    controller._filter._program = program  # type: ignore[assignment]
+    controller._filter._program = controller._filter._second_program = program  # type: ignore[assignment]
     return controller.decide(pose, velocity, neighbours, terms, CELLS), program
 
 

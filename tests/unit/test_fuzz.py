@@ -22,6 +22,7 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from pydantic.fields import FieldInfo
 
 from protocol.errors import MessageError
+from protocol.messages import Quaternion
 from protocol.topics import TOPICS
 from protocol.wire import MAX_MEMBERS, MAX_MESSAGE_BYTES, Message, WireArray, decode, encode
 
@@ -47,6 +48,8 @@ def valid(kind: type[Message]) -> st.SearchStrategy[Message]:
 
 def values(annotation: Any) -> st.SearchStrategy[Any]:
     """Of a field that is annotated so."""
+    if annotation == Quaternion:
+        return st.sampled_from([(1.0, 0.0, 0.0, 0.0), (0.0, -0.6, 0.0, 0.8), (0.5, 0.5, -0.5, 0.5)])
     if annotation == WireArray:
         return st.sampled_from(["<f4", "<f8", "<i2", "<i4", "|u1"]).flatmap(finite_arrays)
     origin, inner = get_origin(annotation), get_args(annotation)

@@ -42,9 +42,8 @@ def run_of(
     poses[:, 1, 0], poses[:, :, 2] = 2.0 + away_m, heights
     none, words = np.zeros((ticks, drones)), np.full((ticks, drones), "flying")
     time_s = TICK_S * np.arange(ticks)
-    flight = Flight(
-        np.array([2, 4]), time_s, poses, none, none, none, none, none, words, words, np.array(shares, dtype=float)
-    )
+    numbers = [none] * 7
+    flight = Flight(np.array([2, 4]), time_s, poses, *numbers, words, words, np.array(shares, dtype=float))
     summary: dict[str, Any] = {"exit_reason": reason, "J": 0.249, "sim_time_s": 0.25, "min_separation_m": 2.0}
     curves = {"time_s": time_s, "importance": np.linspace(1.0, 0.249, ticks)}
     return Run(mission, curves, flight, None, summary)
