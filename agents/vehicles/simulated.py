@@ -13,6 +13,8 @@ from protocol.geometry import Floats
 from protocol.messages import Setpoint, Tick, VehicleSample
 from protocol.mission import Flight
 
+DOWN_M = 0.05
+"""Below this height a vehicle that was told to land stands on the ground."""
 CLIMB_MPS, APPROACH_PER_S = 0.5, 0.8
 """How it climbs to its start's height: so fast at most, and slower in the last metres."""
 UP_M = 0.1
@@ -53,7 +55,8 @@ class SimulatedVehicle:
         height_m = sample.pose[2]
         if self._authority in ("starting", "ours") and sample.battery == 0:
             self._authority = "landing"
-        if self._authority in ("landing", "ours") and down:
+        touches = (sample.truth or sample.pose)[2] < DOWN_M  # felt, whatever it takes its height for
+        if (self._authority == "landing" and touches) or (self._authority in ("landing", "ours") and down):
             self._authority = "landed"
         if self._authority == "starting" and height_m > self._start_m - UP_M:
             self._authority = "ours"
