@@ -464,10 +464,8 @@ class Agent:
             fallbacks=self._fallbacks,
             refused=self._bus.statistics.unused + self._replication.refused,
             telemetry_age_s=age_s,
+            obstacle_margin_m=rows.margin("obstacle", UNLIMITED),
         )
-        if self._mission.flight.obstacles.enabled:
-            margin = rows.margin("obstacle", UNLIMITED)
-            self._control = self._control.model_copy(update={"obstacle_margin_m": margin})
 
 
 async def run_agent(mission: Mission, drone: int, link: Link, *, lockstep: bool) -> None:

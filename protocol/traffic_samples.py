@@ -10,6 +10,7 @@ from protocol.aggregator import REPEATED
 from protocol.blocks import SKETCHES, BlockLayout
 from protocol.field import VirtualField
 from protocol.messages import (
+    UNLIMITED,
     Control,
     DroneState,
     ExternalPose,
@@ -60,9 +61,8 @@ def state(drone: int, *, obstacles: bool = False) -> DroneState:
         fallbacks=12,
         refused=0,
         telemetry_age_s=0.0123,
+        obstacle_margin_m=0.456 if obstacles else UNLIMITED,
     )
-    if obstacles:
-        control = control.model_copy(update={"obstacle_margin_m": 0.456})
     return DroneState(
         drone=drone,
         tick=TICK,

@@ -6,7 +6,7 @@ does a length that the bytes only claim cost memory or time before it is refused
 
 Processes of different minor versions understand each other: a newer one may add fields, which an older one passes over
 and for which a newer one that does not find them takes their defaults. So what lies within a message is sent without
-the fields that were not set.
+the fields that are at theirs.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import reprlib
 from collections.abc import Callable, Sized
+from functools import cache
 from typing import Annotated, Any, ClassVar, TypeVar
 
 import msgpack
@@ -109,9 +110,16 @@ def encode(message: Message) -> bytes:
 def _plain(value: object) -> object:
     if isinstance(value, np.ndarray):
         return _array_to_wire(value)
-    if isinstance(value, BaseModel):  # what nobody set is its default to the reader too
-        return {name: field for name, field in value.__dict__.items() if name in value.model_fields_set}
+    if isinstance(value, BaseModel):
+        defaults = _defaults(type(value))
+        fields = value.__dict__.items()
+        return {name: field for name, field in fields if name not in defaults or field != defaults[name]}
     raise TypeError(f"{type(value).__name__} has no wire format")
+
+
+@cache
+def _defaults(kind: type[BaseModel]) -> dict[str, Any]:
+    return {name: field.default for name, field in kind.model_fields.items() if not field.is_required()}
 
 
 def decode(kind: type[M], data: bytes) -> M:

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import Final
 
 from protocol.airspace import in_words as in_words_of_zone
+from protocol.messages import UNLIMITED
 
 BOUNDS: Final = {
     "x": "speed limit along x",
@@ -15,9 +16,6 @@ BOUNDS: Final = {
     "pitch": "tilt rate limit",
 }
 """Of the velocity that the program looks for; a limit of acceleration shows as one of these as well."""
-
-NO_ROW: Final = 1e6
-"""m, m^2 or rad^2: no real margin is so large."""
 
 
 def in_words(row: str) -> str:
@@ -46,5 +44,5 @@ def all_in_words(rows: Iterable[str]) -> str:
 
 
 def margin(value: float) -> float | None:
-    """A margin of a decision; None where there is no such row, for which agents say a very large number."""
-    return value if value < NO_ROW else None
+    """A margin of a decision; None where there is no such row."""
+    return value if value < UNLIMITED else None

@@ -12,6 +12,7 @@ from ground_station.report.figures import FAINT, LIMIT, span, svg, svg_of_stack
 from ground_station.report.run_data import Flight
 from ground_station.report.spells import spells
 from protocol.geometry import Floats
+from protocol.messages import UNLIMITED
 from protocol.mission import Mission
 
 if TYPE_CHECKING:
@@ -27,8 +28,6 @@ DASHED = (0, (4, 3))
 HISTOGRAM_BINS = 60
 COLUMNS, COARSE_COLUMNS = 500, 150
 """Stretches that a flight is drawn in, however long it was: about one a pixel, and fewer for what scatters."""
-NO_ROW = 1e6
-"""A margin beyond it comes from no row at all: a single drone has nobody to keep away from."""
 NEAR = 4.0
 """Separation barriers are drawn up to so many d², where two drones are more than twice d apart."""
 ZONE_SHADE = 0.35
@@ -54,12 +53,12 @@ def margins(flight: Flight, mission: Mission) -> str:
         ("region (m)", flight.region_margin_m),
         ("pitch (rad²)", flight.pitch_margin_rad2),
     ]
-    if (flight.obstacle_margin_m < NO_ROW).any():
+    if (flight.obstacle_margin_m < UNLIMITED).any():
         rows.insert(2, ("obstacles (m)", flight.obstacle_margin_m))
 
     def of(place: int, label: str, margin: Floats) -> Any:
         def draw(axes: Axes) -> None:
-            for index, time_s, smallest in _stretches(flight, np.where(margin < NO_ROW, margin, np.nan), np.fmin):
+            for index, time_s, smallest in _stretches(flight, np.where(margin < UNLIMITED, margin, np.nan), np.fmin):
                 axes.plot(
                     time_s, smallest, color=drone_colour(index), linewidth=1, label=_name(flight, index, place == 0)
                 )

@@ -92,7 +92,7 @@ def fly(room: int, *, enabled: bool, seconds: float, folder: Path) -> Flight:
                 drones="".join(START.format(id=k, start=list(start)) for k, start in enumerate(starts(room), start=1)),
             )
         )
-        figures.write_text(json.dumps(_figures(run_flight(mission, "--drones", str(DRONES)))))
+        figures.write_text(json.dumps(_figures(run_flight(mission))))
     return Flight(**json.loads(figures.read_text()))
 
 
@@ -156,12 +156,8 @@ def main(arguments: Sequence[str]) -> None:
             flight = fly(room, enabled=enabled, seconds=asked.seconds, folder=asked.folder)
             flights.append(flight)
             print(f"{number}/{len(rooms)} room-{room} {'with' if enabled else 'without'}: {flight}", flush=True)
-        _write("\n".join(table(flown, asked.seconds)))
+        write_measured(PAGE, "\n".join(table(flown, asked.seconds)))
     print("\n".join(table(flown, asked.seconds)))
-
-
-def _write(measured: str) -> None:
-    write_measured(PAGE, measured)
 
 
 if __name__ == "__main__":

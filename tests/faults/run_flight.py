@@ -9,10 +9,10 @@ from pathlib import Path
 COMMAND = (sys.executable, "-P", "-c", "from deploy.cli import main; main()", "run", "--headless")
 
 
-def run_flight(mission: Path, *options: str) -> Path:
+def run_flight(mission: Path) -> Path:
     """The folder of the run, beside the mission's file. Raises `SystemExit` with what one said that failed."""
     ran = subprocess.run(
-        [*COMMAND, str(mission), "--out", str(mission.parent), *options],
+        [*COMMAND, str(mission), "--out", str(mission.parent)],
         check=False,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
